@@ -1,0 +1,52 @@
+# Thin: each target calls cmake, ctest or python.
+PYTHON := .venv/bin/python
+JOBS := $(shell nproc 2>/dev/null || echo 2)
+MAKEFLAGS += --no-print-directory
+C_FILES = find firmware tests/unit -name '*.[ch]' -not -path '*/generated/*'
+
+.DEFAULT_GOAL := help
+.PHONY: help setup firmware demo test lint format generate clean
+
+help: ## list the targets
+	@echo "DIARC ECU: make TARGET"
+	@echo
+	@awk -F ': ## ' '/^[a-z]+: ## / { printf "  %-10s %s\n", $$1, $$2 }' Makefile
+
+setup: ## install what the demo and the tests need: Debian packages and .venv
+	@tools/setup.sh test
+
+firmware: ## build the Linux ECU, firmware/diarc_ecu, and the libraries for Python (cmake and gcc only)
+	@cmake --preset default
+	@cmake --build build --parallel $(JOBS)
+
+demo: ## the ECU moves a simulated arm; needs no CAN hardware
+	@tools/setup.sh demo
+	@$(MAKE) firmware
+	@$(PYTHON) tools/demo.py
+
+test: ## every test: unit tests in C, then pytest
+	@tools/setup.sh test
+	@cmake --preset test
+	@cmake --build build --parallel $(JOBS)
+	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
+	@$(PYTHON) -m pytest
+
+lint: ## check the style of Python and C
+	@tools/setup.sh demo
+	@.venv/bin/ruff check
+	@.venv/bin/ruff format --check
+	@$(C_FILES) -exec .venv/bin/clang-format --dry-run --Werror {} +
+
+format: ## format Python and C
+	@tools/setup.sh demo
+	@.venv/bin/ruff check --fix --exit-zero
+	@.venv/bin/ruff format
+	@$(C_FILES) -exec .venv/bin/clang-format -i {} +
+
+generate: ## make the generated files again: the frames in C from the DBC, and what follows from it
+	@tools/setup.sh demo
+	@$(PYTHON) tools/generate.py
+
+clean: ## remove what was built; .venv stays
+	@rm -rf build firmware/diarc_ecu .pytest_cache .ruff_cache
+	@find . -name __pycache__ -type d -not -path './.venv/*' -prune -exec rm -rf {} +

@@ -1,0 +1,141 @@
+# The Unity test framework (ThrowTheSwitch, MIT) as the target `unity`. It is fetched, never committed:
+#   1. UNITY_ROOT, an environment or cache variable: a folder with unity.c, unity.h and unity_internals.h, or one
+#      that has them in src/;
+#   2. the user's cache: ${XDG_CACHE_HOME:-~/.cache}/diarc-ecu/unity-<version>;
+#   3. Debian's and Ubuntu's source package ntpsec 1.2.2, which carries Unity 2.5.1, through apt-get and the
+#      package sources this machine already has (its configuration is not touched);
+#   4. upstream's release archive.
+# What 3 and 4 bring is checked by SHA-256 and goes to the cache.
+
+set(UNITY_ROOT "" CACHE PATH "Folder with the Unity test framework's sources (empty: fetched)")
+
+set(unity_files unity.c unity.h unity_internals.h)
+set(unity_ntpsec_version 1.2.2+dfsg1)
+set(unity_ntpsec_sha256 53e527e3d04d551d41af2d359c2715c2de5f5bfa2a695d4ec1a811b3e9137f63)
+set(unity_upstream_url https://github.com/ThrowTheSwitch/Unity/archive/refs/tags/v2.5.2.zip)
+set(unity_upstream_sha256 4598298723ecca1f242b8c540a253ae4ab591f6810cbde72f128961007683034)
+
+if(NOT "$ENV{XDG_CACHE_HOME}" STREQUAL "")
+    set(unity_cache "$ENV{XDG_CACHE_HOME}/diarc-ecu")
+elseif(NOT "$ENV{HOME}" STREQUAL "")
+    set(unity_cache "$ENV{HOME}/.cache/diarc-ecu")
+else()
+    set(unity_cache "${PROJECT_BINARY_DIR}/_unity")
+endif()
+
+# Sets `result` to the folder in `folder` or `folder`/src that holds all of Unity, else to nothing.
+function(unity_find folder result)
+    set(${result} "" PARENT_SCOPE)
+    foreach(candidate "${folder}" "${folder}/src")
+        set(complete TRUE)
+        foreach(file IN LISTS unity_files)
+            if(NOT EXISTS "${candidate}/${file}")
+                set(complete FALSE)
+            endif()
+        endforeach()
+        if(complete)
+            set(${result} "${candidate}" PARENT_SCOPE)
+            return()
+        endif()
+    endforeach()
+endfunction()
+
+# Copies Unity from `folder` to `target` in one step, so that an interrupted run leaves no half of it behind.
+function(unity_keep folder target result)
+    set(${result} "" PARENT_SCOPE)
+    unity_find("${folder}" found)
+    if(NOT found)
+        return()
+    endif()
+    string(RANDOM LENGTH 8 tag)
+    foreach(file IN LISTS unity_files)
+        file(COPY "${found}/${file}" DESTINATION "${target}.${tag}")
+    endforeach()
+    file(REMOVE_RECURSE "${target}")
+    file(RENAME "${target}.${tag}" "${target}")
+    set(${result} "${target}" PARENT_SCOPE)
+endfunction()
+
+# Unity 2.5.1 out of the source package, by cmake/unity_from_apt.sh.
+function(unity_from_apt result)
+    set(${result} "" PARENT_SCOPE)
+    set(work "${PROJECT_BINARY_DIR}/_unity/apt")
+    file(REMOVE_RECURSE "${work}")
+    execute_process(
+        COMMAND bash "${PROJECT_SOURCE_DIR}/cmake/unity_from_apt.sh" "${work}" ${unity_ntpsec_version}
+        RESULT_VARIABLE status OUTPUT_VARIABLE archive ERROR_VARIABLE reason
+        OUTPUT_STRIP_TRAILING_WHITESPACE ERROR_STRIP_TRAILING_WHITESPACE)
+    if(status EQUAL 0)
+        file(SHA256 "${archive}" sha256)
+        if(sha256 STREQUAL unity_ntpsec_sha256)
+            file(ARCHIVE_EXTRACT INPUT "${archive}" DESTINATION "${work}" PATTERNS "*/tests/unity/*")
+            unity_keep("${work}/ntpsec-${unity_ntpsec_version}/tests/unity" "${unity_cache}/unity-2.5.1" kept)
+            set(${result} "${kept}" PARENT_SCOPE)
+        else()
+            message(STATUS "Unity: the source package ntpsec has an unexpected SHA-256, ${sha256}")
+        endif()
+    else()
+        message(STATUS "Unity: not from a source package: ${reason}")
+    endif()
+    file(REMOVE_RECURSE "${work}") # the package lists are large
+endfunction()
+
+function(unity_from_upstream result)
+    set(${result} "" PARENT_SCOPE)
+    set(work "${PROJECT_BINARY_DIR}/_unity/upstream")
+    file(REMOVE_RECURSE "${work}")
+    file(DOWNLOAD ${unity_upstream_url} "${work}/unity.zip" STATUS status TLS_VERIFY ON INACTIVITY_TIMEOUT 20 TIMEOUT 60)
+    list(GET status 0 code)
+    list(GET status 1 reason)
+    if(code EQUAL 0)
+        file(SHA256 "${work}/unity.zip" sha256)
+        if(sha256 STREQUAL unity_upstream_sha256)
+            file(ARCHIVE_EXTRACT INPUT "${work}/unity.zip" DESTINATION "${work}")
+            unity_keep("${work}/Unity-2.5.2" "${unity_cache}/unity-2.5.2" kept)
+            set(${result} "${kept}" PARENT_SCOPE)
+        else()
+            message(STATUS "Unity: upstream's archive has an unexpected SHA-256, ${sha256}")
+        endif()
+    else()
+        message(STATUS "Unity: not from upstream: ${reason}")
+    endif()
+    file(REMOVE_RECURSE "${work}")
+endfunction()
+
+set(unity_dir "")
+set(unity_given "${UNITY_ROOT}")
+if(NOT unity_given)
+    set(unity_given "$ENV{UNITY_ROOT}")
+endif()
+if(unity_given)
+    unity_find("${unity_given}" unity_dir)
+    if(NOT unity_dir)
+        message(FATAL_ERROR "UNITY_ROOT=${unity_given} has no unity.c, unity.h and unity_internals.h, nor has its src/")
+    endif()
+else()
+    foreach(version 2.5.1 2.5.2)
+        if(NOT unity_dir)
+            unity_find("${unity_cache}/unity-${version}" unity_dir)
+        endif()
+    endforeach()
+    if(NOT unity_dir)
+        message(STATUS "Unity: fetching the test framework")
+        unity_from_apt(unity_dir)
+    endif()
+    if(NOT unity_dir)
+        unity_from_upstream(unity_dir)
+    endif()
+    if(NOT unity_dir)
+        message(FATAL_ERROR
+            "The Unity test framework could not be fetched; the lines above say why. Get its sources from\n"
+            "https://github.com/ThrowTheSwitch/Unity (any 2.5 or later) and say where they are:\n"
+            "  UNITY_ROOT=/path/to/Unity make test")
+    endif()
+endif()
+message(STATUS "Unity: ${unity_dir}")
+
+add_library(unity STATIC "${unity_dir}/unity.c")
+target_include_directories(unity SYSTEM PUBLIC "${unity_dir}")
+target_compile_definitions(unity PUBLIC UNITY_INCLUDE_DOUBLE UNITY_DOUBLE_PRECISION=1e-12)
+target_compile_options(unity PRIVATE -O2 -g)
+target_link_libraries(unity PUBLIC m)
