@@ -1,0 +1,90 @@
+#include "control/diarc.h"
+
+static scalar symmetric_limit(scalar x, scalar bound)
+{
+    return limit(x, -bound, bound);
+}
+
+/* (gamma_M + |theta_max - theta_min| |phi|)^2 / (4 eta), Eq 22, but at most `most`. */
+static scalar robust_gain(scalar bound, scalar eta, scalar most)
+{
+    /* compared before dividing, so that a large bound cannot overflow */
+    const scalar squared = mul(bound, bound);
+    const scalar four_eta = SCALAR(4) * eta;
+    return squared < mul(most, four_eta) ? quot(squared, four_eta) : most;
+}
+
+/* Everything of one tick that the state does not change. */
+struct two_steps {
+    scalar e2, F_Ld, e3, Q_Ld;
+};
+
+static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_gains *gains,
+                                  const struct diarc_input *in, scalar ff_rate)
+{
+    const scalar R = in->cylinder.R;
+    const scalar H = in->H;
+    struct two_steps s;
+
+    /* step 1: torque */
+    s.e2 = in->e1_rate + amp(gains->k1, in->e1); /* Eq 11 */
+    const scalar k2s1 = robust_gain(gains->gamma1_max + in->torque_uncertainty, gains->eta1,
+                                    amp(gains->k2s1_max, H)); /* Eq 22 */
+    const scalar feedback = mul(H, amp(gains->k2, s.e2));
+    s.F_Ld = quot(in->torque_ff - feedback - diarc->gamma1 - mul(k2s1, s.e2), R); /* Eq 14, 20 */
+
+    /* F_Ld'_c: the feed-forward's difference, free of noise, and the feedback's analytic derivative with
+     * H e2'^ from the model: H (q''^ - qd'') = R F - phi2' theta^ + gamma1. R' is left out: 0.1 % of it. */
+    const scalar H_e2_rate =
+        mul(R, in->force) - in->torque_ff + diarc->gamma1 + mul(H, amp(gains->k1, in->e1_rate));
+    const scalar gamma1_rate = mul(H, amp(gains->kappa1, s.e2));                         /* Eq 20 */
+    const scalar F_Ld_rate = quot(ff_rate - amp(gains->k2, H_e2_rate) - gamma1_rate, R); /* Eq 17 */
+
+    /* step 2: flow */
+    s.e3 = in->force - s.F_Ld;
+    const scalar w = in->reference_w + in->e1_rate;
+    const scalar mu = -mul(gains->w1_over_w2, mul(R, s.e2)); /* Eq 18 */
+    const scalar k2s2 =
+        robust_gain(gains->gamma2_max + in->flow_uncertainty + mul(in->beta_uncertainty, absolute(F_Ld_rate)),
+                    gains->eta2, amp(gains->k2s2_max, in->beta_inverse));
+    s.Q_Ld = mul(in->cylinder.lamA, mul(R, w)) + mul(in->beta_inverse, F_Ld_rate) + in->leakage -
+             in->flow_offset - mul(in->beta_inverse, amp(gains->k3, s.e3)) + mu - diarc->gamma2 -
+             mul(k2s2, s.e3); /* Eq 18, 20 */
+    return s;
+}
+
+void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in,
+                 scalar dt_s)
+{
+    (void)dt_s;
+    *diarc = (struct diarc){.torque_ff = in->torque_ff, .started = true};
+    /* at rest on the reference F_Ld = (torque_ff - gamma1) / R; then e3 = 0 */
+    diarc->gamma1 = symmetric_limit(in->torque_ff - mul(in->cylinder.R, in->force), gains->gamma1_max);
+    const struct two_steps s = two_steps(diarc, gains, in, SCALAR(0));
+    diarc->gamma2 = symmetric_limit(s.Q_Ld, gains->gamma2_max);
+}
+
+struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
+                               const struct diarc_input *in, scalar dt_s)
+{
+    /* What the estimate took over, gamma1 gives back: adaptation alone moves no force. */
+    diarc->gamma1 = symmetric_limit(diarc->gamma1 + in->torque_step, gains->gamma1_max);
+    const scalar ff_before = diarc->torque_ff + in->torque_step;
+    const scalar ff_rate = quot(in->torque_ff - ff_before, dt_s);
+    diarc->torque_ff = in->torque_ff;
+
+    const struct two_steps s = two_steps(diarc, gains, in, ff_rate);
+    const scalar valve_gain = s.Q_Ld >= SCALAR(0) ? in->gain_extending : in->gain_retracting;
+    const scalar wanted = quot(s.Q_Ld, valve_gain); /* Eq 7 */
+    const scalar u = symmetric_limit(wanted, SCALAR(1));
+    const bool saturated = u != wanted;
+
+    /* gamma' = kappa e, integrated and then clamped, Eq 20 and 21; held while the valve cannot follow */
+    if (!saturated) {
+        diarc->gamma1 = symmetric_limit(diarc->gamma1 + mul(dt_s, mul(in->H, amp(gains->kappa1, s.e2))),
+                                        gains->gamma1_max);
+        diarc->gamma2 = symmetric_limit(
+            diarc->gamma2 + mul(dt_s, mul(in->beta_inverse, amp(gains->kappa2, s.e3))), gains->gamma2_max);
+    }
+    return (struct diarc_output){.u = u, .F_Ld = s.F_Ld, .e2 = s.e2, .e3 = s.e3, .saturated = saturated};
+}

@@ -1,0 +1,259 @@
+#include "control/estimator.h"
+
+/* An update needs the gate open over this much of the filter's window. */
+#define LEAST_OPEN SCALAR(0.02)
+
+/* Rows in turn: one update a tick keeps the longest tick short, and samples of a filtered row that follow one
+ * another hold little that is new. */
+#define ROW_TURNS 4
+
+static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
+    [SWING] = {BETA_INVERSE, OM2_SWING, OM3_SWING},
+    [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
+};
+
+static scalar square(scalar x)
+{
+    return mul(x, x);
+}
+
+struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s)
+{
+    struct estimator_constants constants = {0};
+    constants.filter = quot(dt_s, parameters->filter_time + dt_s);
+    constants.per_tick = quot(SCALAR(1), dt_s);
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        constants.residual_m[i] = quot(SCALAR(1), parameters->torque_noise[i]);
+        constants.residual_h[i] = quot(SCALAR(1), parameters->flow_noise[i]);
+    }
+    for (uint8_t k = 0; k < THETA_M; k++) {
+        constants.scale_m[k] = parameters->m[k].high - parameters->m[k].low;
+        constants.step_m[k] = mul(constants.scale_m[k], amp(parameters->rate_limit, dt_s));
+        for (uint8_t i = 0; i < JOINTS; i++) {
+            constants.phi_m[i][k] = mul(constants.scale_m[k], constants.residual_m[i]);
+        }
+    }
+    for (uint8_t k = 0; k < THETA_H; k++) {
+        constants.scale_h[k] = parameters->h[k].high - parameters->h[k].low;
+        constants.step_h[k] = mul(constants.scale_h[k], amp(parameters->rate_limit, dt_s));
+        for (uint8_t i = 0; i < JOINTS; i++) {
+            constants.phi_h[i][k] = mul(constants.scale_h[k], constants.residual_h[i]);
+        }
+    }
+    /* two updates, one per row of the mechanics, every ROW_TURNS ticks */
+    constants.walk =
+        mul(square(quot(parameters->load_walk, constants.scale_m[M_T])), mul(dt_s, SCALAR(ROW_TURNS / 2)));
+    constants.load_variance = square(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
+    return constants;
+}
+
+static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
+                        scalar law[], struct ud_factors *covariance)
+{
+    scalar variance[UD_SIZE_MAX];
+    for (uint8_t k = 0; k < size; k++) {
+        theta[k] = prior[k].value;
+        law[k] = prior[k].value;
+        variance[k] = square(quot(prior[k].sd, scale[k]));
+    }
+    ud_start(covariance, size, variance);
+}
+
+void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
+                     const struct estimator_constants *constants)
+{
+    *estimator = (struct estimator){0};
+    start_block(parameters->m, THETA_M, constants->scale_m, estimator->theta_m, estimator->law_m,
+                &estimator->covariance_m);
+    start_block(parameters->h, THETA_H, constants->scale_h, estimator->theta_h, estimator->law_h,
+                &estimator->covariance_h);
+    estimator_resume(estimator);
+}
+
+void estimator_resume(struct estimator *estimator)
+{
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
+            estimator->row_m[i][k] = (struct two_poles){0};
+        }
+        for (uint8_t k = 0; k <= HYDRAULIC_COLUMNS; k++) {
+            estimator->row_h[i][k] = (struct two_poles){0};
+        }
+        estimator->open[i] = (struct two_poles){0};
+        estimator->previous_gate[i] = SCALAR(0);
+    }
+    estimator->samples = 0;
+    estimator->since_update = ROW_TURNS;
+    estimator->updating = false;
+}
+
+static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
+{
+    filter->first += mul(pole_step, x - filter->first);
+    filter->second += mul(pole_step, filter->first - filter->second);
+}
+
+/* 0 at rest, 1 from twice the gate's rate on. */
+static scalar gate(const struct estimator_parameters *parameters, scalar reference_w)
+{
+    const scalar excess = absolute(reference_w) - parameters->gate_rate;
+    return limit(quot(excess, parameters->gate_rate), SCALAR(0), SCALAR(1));
+}
+
+/* Momentum balance of joint i over the sample (k-3/2, k-1/2), gated and filtered, Eq 25. */
+static void mechanics_balance(struct estimator *e, const struct estimator_constants *constants,
+                              const struct arm *arm, enum joint i, const struct wrist_trig *half_trig,
+                              const scalar half_w[JOINTS])
+{
+    const struct estimator_sample *const at = &e->previous; /* the instant k-1, in the middle */
+    struct arm_row momentum;
+    arm_momentum(arm, half_trig, i, half_w, &momentum);
+    if (e->samples >= 2u) {
+        scalar middle_w[JOINTS];
+        for (uint8_t n = 0; n < JOINTS; n++) {
+            middle_w[n] = mul(SCALAR(0.5), e->previous_w[n] + half_w[n]);
+        }
+        struct arm_row force;
+        arm_force(arm, &at->trig, i, middle_w, at->reference_w[i], &force);
+        const struct arm_row *const before = &e->previous_momentum[i];
+        const scalar g = e->previous_gate[i];
+        for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
+            const scalar rate = amp(constants->per_tick, momentum.phi[k] - before->phi[k]);
+            low_pass(&e->row_m[i][k], constants->filter, mul(g, rate + force.phi[k]));
+        }
+        const scalar rate = amp(constants->per_tick, momentum.known - before->known);
+        const scalar torque = mul(at->cylinder[i].R, at->force[i]);
+        low_pass(&e->row_m[i][ROW_COLUMNS], constants->filter, mul(g, rate + force.known - torque));
+    }
+    e->previous_momentum[i] = momentum;
+}
+
+/* Flow balance of joint i over the sample (k-1, k), gated and filtered: Eq 6 in the form of Eq 25. */
+static void hydraulics_balance(struct estimator *e, const struct estimator_constants *constants, enum joint i,
+                               scalar half_w, const struct estimator_sample *now)
+{
+    const struct estimator_sample *const before = &e->previous;
+    const struct cylinder_state *const c0 = &before->cylinder[i];
+    const struct cylinder_state *const c1 = &now->cylinder[i];
+    const scalar half = SCALAR(0.5);
+    const scalar g = e->previous_gate[i];
+    const scalar force_rate = amp(constants->per_tick, now->force[i] - before->force[i]);
+    const scalar displaced = mul(mul(half, mul(c0->lamA, c0->R) + mul(c1->lamA, c1->R)), half_w);
+    const scalar flow = mul(half, before->flow[i] + now->flow[i]);
+    struct two_poles *const row = e->row_h[i];
+    low_pass(&row[0], constants->filter, mul(g, force_rate));
+    low_pass(&row[1], constants->filter, -mul(g, mul(half, c0->lamB + c1->lamB)));
+    low_pass(&row[2], constants->filter, -mul(g, mul(half, c0->lamC + c1->lamC)));
+    low_pass(&row[3], constants->filter, mul(g, displaced - flow));
+}
+
+/* theta += K residual, then projection onto the bounds, Eq 21: integrate, then clamp. */
+static void update_block(struct ud_factors *covariance, const scalar phi[], scalar residual,
+                         const scalar scale[], const struct prior prior[], scalar theta[])
+{
+    scalar K[UD_SIZE_MAX];
+    (void)ud_update(covariance, phi, K);
+    for (uint8_t k = 0; k < covariance->size; k++) {
+        theta[k] = limit(theta[k] + mul(scale[k], mul(K[k], residual)), prior[k].low, prior[k].high);
+    }
+}
+
+static void update_mechanics(struct estimator *e, const struct estimator_parameters *parameters,
+                             const struct estimator_constants *constants, enum joint i)
+{
+    scalar phi[THETA_M] = {0};
+    scalar residual = -e->row_m[i][ROW_COLUMNS].second;
+    for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
+        const uint8_t parameter = row_parameter[i][k];
+        const scalar column = e->row_m[i][k].second;
+        residual -= mul(column, e->theta_m[parameter]);
+        phi[parameter] = mul(column, constants->phi_m[i][parameter]);
+    }
+    if (ud_variance(&e->covariance_m, M_T) < constants->load_variance) {
+        e->covariance_m.D[M_T] += constants->walk;
+    }
+    update_block(&e->covariance_m, phi, mul(residual, constants->residual_m[i]), constants->scale_m,
+                 parameters->m, e->theta_m);
+}
+
+static void update_hydraulics(struct estimator *e, const struct estimator_parameters *parameters,
+                              const struct estimator_constants *constants, enum joint i)
+{
+    scalar phi[THETA_H] = {0};
+    scalar residual = -e->row_h[i][HYDRAULIC_COLUMNS].second;
+    for (uint8_t k = 0; k < HYDRAULIC_COLUMNS; k++) {
+        const uint8_t parameter = hydraulic_parameter[i][k];
+        const scalar column = e->row_h[i][k].second;
+        residual -= mul(column, e->theta_h[parameter]);
+        phi[parameter] = mul(column, constants->phi_h[i][parameter]);
+    }
+    update_block(&e->covariance_h, phi, mul(residual, constants->residual_h[i]), constants->scale_h,
+                 parameters->h, e->theta_h);
+}
+
+/* sat_M: the law's estimate follows by at most `step` a tick. */
+static void rate_limit(scalar law[], const scalar theta[], const scalar step[], uint8_t size)
+{
+    for (uint8_t k = 0; k < size; k++) {
+        law[k] += limit(theta[k] - law[k], -step[k], step[k]);
+    }
+}
+
+void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
+                    const struct estimator_constants *constants, const struct arm *arm,
+                    const struct estimator_sample *sample)
+{
+    scalar half_w[JOINTS];
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        half_w[i] = amp(constants->per_tick, sample->dq[i]);
+    }
+    if (e->samples >= 1u) {
+        /* the mean of two instants is the half step's value to O((w dt)^2) */
+        const struct wrist_trig half_trig = {
+            .s = mul(SCALAR(0.5), e->previous.trig.s + sample->trig.s),
+            .c = mul(SCALAR(0.5), e->previous.trig.c + sample->trig.c),
+            .r = mul(SCALAR(0.5), e->previous.trig.r + sample->trig.r),
+        };
+        for (uint8_t i = 0; i < JOINTS; i++) {
+            low_pass(&e->open[i], constants->filter, e->previous_gate[i]);
+            mechanics_balance(e, constants, arm, (enum joint)i, &half_trig, half_w);
+            hydraulics_balance(e, constants, (enum joint)i, half_w[i], sample);
+        }
+    }
+    if (e->samples < 2u) {
+        e->samples++;
+    }
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        e->previous_w[i] = half_w[i];
+        e->previous_gate[i] = gate(parameters, sample->reference_w[i]);
+    }
+    e->previous = *sample;
+
+    const enum joint i = (enum joint)(e->turn % JOINTS);
+    const bool mechanics = e->turn < JOINTS;
+    e->turn = (uint8_t)((e->turn + 1u) % ROW_TURNS);
+    e->since_update = e->since_update < ROW_TURNS ? (uint8_t)(e->since_update + 1u) : ROW_TURNS;
+    if (e->open[i].second > LEAST_OPEN) {
+        if (mechanics) {
+            update_mechanics(e, parameters, constants, i);
+        } else {
+            update_hydraulics(e, parameters, constants, i);
+        }
+        e->since_update = 0;
+    }
+    e->updating = e->since_update < ROW_TURNS;
+    rate_limit(e->law_m, e->theta_m, constants->step_m, THETA_M);
+    rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
+}
+
+scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,
+                      enum theta_m k)
+{
+    return mul(root(ud_variance(&estimator->covariance_m, (uint8_t)k)), constants->scale_m[k]);
+}
+
+scalar estimator_sd_h(const struct estimator *estimator, const struct estimator_constants *constants,
+                      enum theta_h k)
+{
+    return mul(root(ud_variance(&estimator->covariance_h, (uint8_t)k)), constants->scale_h[k]);
+}

@@ -1,0 +1,118 @@
+/* The indirect half of DIARC: least squares on filtered regressions, Eq 25 and 26.
+ *
+ * Mechanics. Acceleration is never formed. The momentum m = row of H(q) q' is balanced over one sample,
+ *     [ m_(k-1/2) - m_(k-3/2) ] / dt + f_(k-1) = R F_(k-1)                       exact to O(dt^2)
+ * with the rates of the half steps straight from the encoder's increments, and f all other terms. Both sides
+ * are multiplied by the same gate, 0..1, and passed through the same filter (two poles): whatever the gate and
+ * the filter are, the equation still holds, so nothing of them biases the estimate.
+ *
+ * Gate. At low speed friction is not what the model says, and at rest it looks like load: the gate opens with
+ * the reference's speed, and the estimate rests while it is shut.
+ *
+ * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over one sample against the flow's mean,
+ *     1/be (F_k - F_(k-1)) / dt = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
+ * with QL from the measured spool; no pressure is differentiated but inside the filter.
+ *
+ * Least squares runs on UD factors, one row a tick in turn; then projection onto the bounds. The law gets the
+ * estimate through a rate limit: sat_M(Proj(..)). Only the load walks: its variance grows while the gate is
+ * open, up to its prior (covariance bound), so that it is forgotten at a known rate and nothing winds up. */
+#ifndef CONTROL_ESTIMATOR_H
+#define CONTROL_ESTIMATOR_H
+
+#include "control/arm_model.h"
+#include "control/hydraulics.h"
+#include "control/ud_factors.h"
+
+/* theta_h: 1/be, then the offsets Om2 (bore), Om3 (annulus) of each joint. */
+enum theta_h { BETA_INVERSE, OM2_SWING, OM3_SWING, OM2_WRIST, OM3_WRIST, THETA_H };
+
+/* One parameter's prior knowledge. */
+struct prior {
+    scalar value;
+    scalar sd; /* standard deviation; 0 pins the parameter to its value */
+    scalar low, high;
+};
+
+struct estimator_parameters {
+    struct prior m[THETA_M];
+    struct prior h[THETA_H];
+    scalar filter_time;          /* each of the two poles, s */
+    scalar gate_rate;            /* the gate opens from this reference rate on, full at twice it; rad/s */
+    scalar torque_noise[JOINTS]; /* sd of a filtered row of the mechanics, N m */
+    scalar flow_noise[JOINTS];   /* sd of a filtered row of the hydraulics, m^2/s */
+    scalar load_walk;            /* the load's sd grows by this in 1 s of open gate, kg */
+    gain rate_limit;             /* of the estimate the law sees, ranges per second */
+};
+
+struct estimator_constants {
+    scalar filter;                 /* pole step, dt / (filter_time + dt) */
+    gain per_tick;                 /* 1 / dt */
+    scalar phi_m[JOINTS][THETA_M]; /* regressor scale: prior range over noise */
+    scalar phi_h[JOINTS][THETA_H];
+    scalar residual_m[JOINTS]; /* 1 / noise */
+    scalar residual_h[JOINTS];
+    scalar scale_m[THETA_M]; /* high - low */
+    scalar scale_h[THETA_H];
+    scalar step_m[THETA_M]; /* rate limit per tick */
+    scalar step_h[THETA_H];
+    scalar walk;          /* variance the load gains per update, in its scale */
+    scalar load_variance; /* its bound, in its scale */
+};
+
+/* What one tick measured and the reference it was measured at. */
+struct estimator_sample {
+    scalar dq[JOINTS];          /* encoder increment over the last tick, rad */
+    scalar reference_w[JOINTS]; /* qd', rad/s */
+    struct wrist_trig trig;     /* at the measured q2 */
+    struct cylinder_state cylinder[JOINTS];
+    scalar force[JOINTS]; /* F */
+    scalar flow[JOINTS];  /* QL from the spool, less leakage */
+};
+
+#define HYDRAULIC_COLUMNS 3 /* 1/be, Om2, Om3 */
+
+struct two_poles {
+    scalar first, second;
+};
+
+struct estimator {
+    scalar theta_m[THETA_M]; /* projected least squares */
+    scalar theta_h[THETA_H];
+    scalar law_m[THETA_M]; /* what the law sees: rate limited */
+    scalar law_h[THETA_H];
+    struct ud_factors covariance_m; /* in units of the ranges */
+    struct ud_factors covariance_h;
+    struct two_poles row_m[JOINTS][ROW_COLUMNS + 1]; /* columns, then the known part */
+    struct two_poles row_h[JOINTS][HYDRAULIC_COLUMNS + 1];
+    struct two_poles open[JOINTS]; /* the gate through the same filter: how much of the window it was open */
+    struct estimator_sample previous;
+    scalar previous_w[JOINTS]; /* rate of the last half step */
+    struct arm_row previous_momentum[JOINTS];
+    scalar previous_gate[JOINTS];
+    uint8_t turn;    /* which row is updated next, 0..3 */
+    uint8_t samples; /* since the restart, up to 2: balances need two */
+    bool updating;   /* an update was made within the last four ticks */
+    uint8_t since_update;
+};
+
+struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s);
+
+/* Everything back to the priors. */
+void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
+                     const struct estimator_constants *constants);
+
+/* Forget the samples, keep the estimate: after a gap in the measurements. */
+void estimator_resume(struct estimator *estimator);
+
+/* One tick. */
+void estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                    const struct estimator_constants *constants, const struct arm *arm,
+                    const struct estimator_sample *sample);
+
+/* Standard deviation of parameter k, in its unit. */
+scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,
+                      enum theta_m k);
+scalar estimator_sd_h(const struct estimator *estimator, const struct estimator_constants *constants,
+                      enum theta_h k);
+
+#endif
