@@ -1,0 +1,103 @@
+/* The ECU: modes, frames and the law, one tick at a time. A port calls, every period:
+ *
+ *     ecu_tick_begin      SYNC goes out, the tick is open
+ *     ecu_tick_receive    as often as frames may wait; true once all sensor frames of this tick have come
+ *     ecu_tick_end        the law runs on what has come, the valve frame goes out, then the others
+ *
+ * Between ecu_tick_begin and ecu_tick_end nothing else happens, so the same frames give the same bits on
+ * every bus. No clock but the port's, and that only for the timing frame. */
+#ifndef ECU_ECU_H
+#define ECU_ECU_H
+
+#include "ecu/parameters.h"
+#include "ecu/port.h"
+#include "ecu/receive_table.h"
+
+#define ECU_NODE_ID 1u
+#define ECU_PERIOD_LOW_US 250u
+#define ECU_PERIOD_HIGH_US 20000u
+
+/* Valve set-points are zero and disabled in every mode but RUN. */
+enum ecu_mode {
+    MODE_INIT = 0,    /* waits for all sensors, or for NMT start */
+    MODE_STANDBY = 1, /* sensors good, valves shut */
+    MODE_RUN = 2,     /* the law drives the valves */
+    MODE_FAULT = 15   /* until RESET_FAULT */
+};
+
+enum nmt_state { NMT_STOPPED = 4, NMT_OPERATIONAL = 5, NMT_PRE_OPERATIONAL = 127 };
+
+enum ecu_fault { FAULT_NONE = 0, FAULT_SENSOR_FRAMES_LOST = 1, FAULT_SENSOR_INVALID = 2 };
+
+/* Why a request was not carried out; LastRefusal on the timing frame. */
+enum ecu_refusal {
+    REFUSAL_NONE,
+    REFUSAL_NOT_OPERATIONAL,
+    REFUSAL_NOT_IN_STANDBY,
+    REFUSAL_NOT_IN_RUN,
+    REFUSAL_SENSORS_NOT_FRESH,
+    REFUSAL_MOVE_UNDER_WAY,
+    REFUSAL_TARGET_OUT_OF_RANGE,
+    REFUSAL_DURATION_TOO_SHORT,
+    REFUSAL_NO_FAULT_TO_RESET,
+    REFUSAL_UNKNOWN_REQUEST
+};
+
+/* Raw samples of the last tick they were good in. */
+struct sensor_samples {
+    int32_t angle[JOINTS];
+    int32_t pressure[JOINTS][CHAMBERS];
+    int32_t spool[JOINTS];
+};
+
+struct ecu_counters {
+    uint32_t ticks;      /* since the restart */
+    uint16_t late_ticks; /* ended without all sensor frames; stops at 65535 */
+    uint16_t send_drops; /* frames the port did not take; stops at 65535 */
+    uint16_t refused;    /* requests; stops at 65535 */
+    enum ecu_refusal last_refusal;
+    uint16_t tick_time_us; /* last sensor frame to valve frame, of the last tick; stops at 65535 */
+};
+
+#define ECU_TX_COUNTERS 5
+
+/* All of the ECU; a port owns one and looks into it only to report. */
+struct ecu {
+    struct machine machine;
+    struct bases bases;
+    struct controller_constants constants;
+    struct controller controller;
+    uint32_t period_us;
+    enum ecu_mode mode;
+    enum nmt_state nmt;
+    enum ecu_fault fault;
+    struct receive receive;
+    struct sensor_samples samples;
+    bool sampled;           /* samples hold a complete set */
+    uint8_t sensors_wrong;  /* ticks in a row that sensors were missing or wrong; stops at 255 */
+    bool restart_requested; /* by NMT */
+    bool boot_up_due;
+    bool run_requested;
+    enum controller_kind run_controller;
+    uint8_t sync_counter; /* 1..240 */
+    uint8_t phase;        /* tick modulo the slow frames' cycle */
+    uint8_t next_parameter, next_page, next_joint;
+    uint16_t heartbeat_ticks; /* to the next heartbeat */
+    uint8_t tx_counter[ECU_TX_COUNTERS];
+    uint32_t complete_at_us; /* when the last sensor frame of this tick came */
+    struct ecu_counters counters;
+};
+
+/* Load the image (NULL: the reference arm, built in) and start. period_us: 250..20000. On an error *ecu is
+ * not usable, and with ECU_PARAMETER_RANGE *entry is the parameter's number (parameter_name). */
+enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, uint32_t period_us,
+                         uint16_t *entry);
+
+void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
+bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
+void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port);
+
+/* Valves to zero and disabled, once, now: for a port that is about to stop. */
+void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port);
+
+#endif

@@ -1,0 +1,121 @@
+#include "ecu/parameters.h"
+
+#include <stddef.h>
+
+enum parameter_kind { PARAMETER_SCALAR, PARAMETER_GAIN };
+
+struct parameter_entry {
+    size_t offset; /* in struct machine */
+    enum parameter_kind kind;
+    int8_t exponents[3]; /* twice that of pressure, twice that of area, that of the lever arm */
+    uint32_t low, high;  /* binary32, SI */
+};
+
+static const struct parameter_entry TABLE[PARAMETER_COUNT] = {
+#include "ecu/generated/parameter_table.inc"
+};
+
+const struct parameter_image default_parameter_image = {{
+#include "ecu/generated/default_image.inc"
+}};
+
+#define HEADER_BYTES 12u
+
+static uint32_t read_u32(const uint8_t *bytes)
+{
+    return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
+}
+
+static uint32_t crc32(const uint8_t *bytes, uint32_t length)
+{
+    uint32_t crc = 0xFFFFFFFFu;
+    for (uint32_t k = 0; k < length; k++) {
+        crc ^= bytes[k];
+        for (uint8_t bit = 0; bit < 8u; bit++) {
+            crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
+        }
+    }
+    return ~crc;
+}
+
+/* binary32 bits as an integer that sorts as the numbers do; -0 equals 0. */
+static int32_t real32_order(uint32_t bits)
+{
+    const int32_t magnitude = (int32_t)(bits & 0x7FFFFFFFu);
+    return (bits >> 31) != 0u ? -magnitude : magnitude;
+}
+
+static bool real32_is_number(uint32_t bits)
+{
+    return (bits & 0x7F800000u) != 0x7F800000u;
+}
+
+static bool within(int16_t value, int16_t low, int16_t high)
+{
+    return value >= low && value <= high;
+}
+
+static bool bases_valid(const struct bases *bases)
+{
+    return within(bases->pressure, BASE_PRESSURE_LOW, BASE_PRESSURE_HIGH) && bases->pressure % 2 == 0 &&
+           within(bases->area, BASE_AREA_LOW, BASE_AREA_HIGH) && bases->area % 2 == 0 &&
+           within(bases->lever, BASE_LEVER_LOW, BASE_LEVER_HIGH) &&
+           within(base_torque(bases), BASE_TORQUE_LOW, BASE_TORQUE_HIGH);
+}
+
+static int8_t base_of(const struct parameter_entry *entry, const struct bases *bases)
+{
+    return (int8_t)(entry->exponents[0] * (bases->pressure / 2) + entry->exponents[1] * (bases->area / 2) +
+                    entry->exponents[2] * bases->lever);
+}
+
+enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
+                                const struct parameter_image *image, uint16_t *entry)
+{
+    const uint8_t *const bytes = image->bytes;
+    *entry = 0;
+    if (bytes[0] != (uint8_t)'D' || bytes[1] != (uint8_t)'I' || bytes[2] != (uint8_t)'A' ||
+        bytes[3] != (uint8_t)'R') {
+        return ECU_IMAGE_NOT_ONE;
+    }
+    if (read_u32(&bytes[4]) != PARAMETER_LAYOUT_HASH) {
+        return ECU_IMAGE_OTHER_LAYOUT;
+    }
+    if (crc32(bytes, PARAMETER_IMAGE_BYTES - 4u) != read_u32(&bytes[PARAMETER_IMAGE_BYTES - 4u])) {
+        return ECU_IMAGE_DAMAGED;
+    }
+    const struct bases found = {(int8_t)bytes[8], (int8_t)bytes[9], (int8_t)bytes[10]};
+    if (!bases_valid(&found)) {
+        return ECU_IMAGE_BASES;
+    }
+    for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
+        const uint32_t bits = read_u32(&bytes[HEADER_BYTES + 4u * k]);
+        if (!real32_is_number(bits) || real32_order(bits) < real32_order(TABLE[k].low) ||
+            real32_order(bits) > real32_order(TABLE[k].high)) {
+            *entry = k;
+            return ECU_PARAMETER_RANGE;
+        }
+    }
+    *bases = found;
+    for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
+        const uint32_t bits = read_u32(&bytes[HEADER_BYTES + 4u * k]);
+        const int8_t exponent = base_of(&TABLE[k], &found);
+        uint8_t *const field = (uint8_t *)machine + TABLE[k].offset;
+        if (TABLE[k].kind == PARAMETER_GAIN) {
+            *(gain *)(void *)field = gain_from_real32(bits, exponent);
+        } else {
+            *(scalar *)(void *)field = scalar_from_real32(bits, exponent);
+        }
+    }
+    return ECU_OK;
+}
+
+int8_t base_torque(const struct bases *bases)
+{
+    return (int8_t)(bases->pressure + bases->area + bases->lever);
+}
+
+int8_t base_volume(const struct bases *bases)
+{
+    return (int8_t)(bases->area + bases->lever);
+}

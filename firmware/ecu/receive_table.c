@@ -1,0 +1,84 @@
+#include "ecu/receive_table.h"
+
+#include "can_protocol/generated/diarc.h"
+#include "ecu/e2e.h"
+
+const struct receive_row receive_table[RX_FRAMES] = {
+    [RX_ENCODERS] = {DIARC_ENCODERS_FRAME_ID, DIARC_ENCODERS_LENGTH, true},
+    [RX_PRESSURES_SWING] = {DIARC_PRESSURES_SWING_FRAME_ID, DIARC_PRESSURES_SWING_LENGTH, true},
+    [RX_PRESSURES_WRIST] = {DIARC_PRESSURES_WRIST_FRAME_ID, DIARC_PRESSURES_WRIST_LENGTH, true},
+    [RX_MOTION] = {DIARC_MOTION_FRAME_ID, DIARC_MOTION_LENGTH, false},
+};
+
+static bool counter_follows(const struct receive *receive, enum received_frame which, uint8_t counter)
+{
+    const struct receive_state *const state = &receive->row[which];
+    if (receive_table[which].cyclic) {
+        return counter == receive->expected && !state->fresh;
+    }
+    return !state->heard || counter != state->counter;
+}
+
+enum receive_result receive_accept(struct receive *receive, const struct can_frame_11bit *frame,
+                                   enum received_frame *which)
+{
+    uint8_t k = 0;
+    while (k < RX_FRAMES && receive_table[k].id != frame->id) {
+        k++;
+    }
+    if (k == RX_FRAMES) {
+        return RECEIVE_ALIEN;
+    }
+    *which = (enum received_frame)k;
+    const struct receive_row *const row = &receive_table[k];
+    struct receive_state *const state = &receive->row[k];
+    enum receive_result result = RECEIVE_GOOD;
+    if (frame->length != row->length) {
+        result = RECEIVE_LENGTH;
+    } else if (!e2e_intact(row->id, frame->data)) {
+        result = RECEIVE_CRC;
+    } else if (!counter_follows(receive, *which, e2e_counter(frame->data))) {
+        result = RECEIVE_COUNTER;
+    }
+    if (result != RECEIVE_GOOD) {
+        if (receive->refused < UINT8_MAX) {
+            receive->refused++;
+        }
+        return result;
+    }
+    state->heard = true;
+    state->fresh = true;
+    state->counter = e2e_counter(frame->data);
+    for (uint8_t n = 0; n < 8u; n++) {
+        state->data[n] = frame->data[n];
+    }
+    return RECEIVE_GOOD;
+}
+
+void receive_begin_tick(struct receive *receive, uint8_t sync_counter)
+{
+    receive->expected = (uint8_t)((sync_counter - 1u) % E2E_COUNTER_STATES);
+    for (uint8_t k = 0; k < RX_FRAMES; k++) {
+        receive->row[k].fresh = false;
+    }
+}
+
+bool receive_complete(const struct receive *receive)
+{
+    for (uint8_t k = 0; k < RX_FRAMES; k++) {
+        if (receive_table[k].cyclic && !receive->row[k].fresh) {
+            return false;
+        }
+    }
+    return true;
+}
+
+void receive_end_tick(struct receive *receive)
+{
+    for (uint8_t k = 0; k < RX_FRAMES; k++) {
+        const struct receive_state *const state = &receive->row[k];
+        if (receive_table[k].cyclic && state->heard && !state->fresh && receive->lost < UINT16_MAX) {
+            receive->lost++;
+        }
+    }
+}

@@ -1,0 +1,213 @@
+#include "ecu/transmit.h"
+
+#include "can_protocol/generated/diarc.h"
+#include "can_protocol/generated/diarc_hash.h"
+#include "ecu/e2e.h"
+#include "ecu/wire.h"
+
+enum tx_counter { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING };
+
+#define VALVE_DISABLED DIARC_VALVES_SWING_CONTROL_DISABLED_CHOICE
+#define VALVE_ACTIVE DIARC_VALVES_SWING_CONTROL_ACTIVE_CHOICE
+
+#define THETA_FRAMES (THETA_M + THETA_H)
+#define TIMING_PAGES 4
+
+/* Protect a packed frame and advance its counter. */
+static void protect(struct ecu *ecu, enum tx_counter which, struct can_frame_11bit *frame)
+{
+    uint8_t *const counter = &ecu->tx_counter[which];
+    e2e_protect((uint16_t)frame->id, *counter, frame->data);
+    *counter = (uint8_t)((*counter + 1u) % E2E_COUNTER_STATES);
+}
+
+struct can_frame_11bit transmit_sync(uint8_t sync_counter)
+{
+    return (struct can_frame_11bit){
+        .id = DIARC_SYNC_FRAME_ID, .length = DIARC_SYNC_LENGTH, .data = {sync_counter}};
+}
+
+struct can_frame_11bit transmit_heartbeat(uint8_t nmt_state)
+{
+    return (struct can_frame_11bit){
+        .id = DIARC_HEARTBEAT_ECU_FRAME_ID, .length = DIARC_HEARTBEAT_ECU_LENGTH, .data = {nmt_state}};
+}
+
+struct can_frame_11bit transmit_emergency(const struct ecu *ecu, uint16_t code)
+{
+    const struct diarc_emcy_ecu_t message = {
+        .error_code = code,
+        .error_register = code != 0u ? 0x81u : 0u, /* generic, manufacturer specific */
+        .fault_code = (uint8_t)ecu->fault,
+        .fault_detail = ecu->counters.ticks,
+    };
+    struct can_frame_11bit frame = {.id = DIARC_EMCY_ECU_FRAME_ID, .length = DIARC_EMCY_ECU_LENGTH};
+    (void)diarc_emcy_ecu_pack(frame.data, &message, sizeof frame.data);
+    return frame;
+}
+
+static int16_t spool_raw(scalar u)
+{
+    return (int16_t)WIRE_ENCODE(u, DIARC_VALVES_SWING_SPOOL, 0, -WIRE_MAX_SPOOL, WIRE_MAX_SPOOL);
+}
+
+struct can_frame_11bit transmit_valves(struct ecu *ecu)
+{
+    const bool active = ecu->mode == MODE_RUN;
+    const struct joint_output *const out = ecu->controller.output;
+    const struct diarc_valves_t message = {
+        .mode = (uint8_t)ecu->mode,
+        .swing_spool = active ? spool_raw(out[SWING].u) : (int16_t)0,
+        .wrist_spool = active ? spool_raw(out[WRIST].u) : (int16_t)0,
+        .swing_control = active ? VALVE_ACTIVE : VALVE_DISABLED,
+        .wrist_control = active ? VALVE_ACTIVE : VALVE_DISABLED,
+        .sync_counter = ecu->sync_counter,
+    };
+    struct can_frame_11bit frame = {.id = DIARC_VALVES_FRAME_ID, .length = DIARC_VALVES_LENGTH};
+    (void)diarc_valves_pack(frame.data, &message, sizeof frame.data);
+    protect(ecu, TX_VALVES, &frame);
+    return frame;
+}
+
+struct can_frame_11bit transmit_estimate(struct ecu *ecu)
+{
+    const struct controller *const controller = &ecu->controller;
+    const struct estimator *const estimator = &controller->estimator;
+    const struct prior *const load = &ecu->machine.estimator.m[M_T];
+    const int8_t base = base_torque(&ecu->bases);
+    const scalar m_t = estimator->theta_m[M_T];
+    const scalar sd = estimator_sd_m(estimator, &ecu->constants.estimator, M_T);
+    const struct joint_output *const out = controller->output;
+    const struct diarc_estimate_t message = {
+        .mode = (uint8_t)ecu->mode,
+        .load = WIRE_ENCODE(m_t, DIARC_ESTIMATE_LOAD, base, -WIRE_MAX_S24, WIRE_MAX_S24),
+        .load_sd = (uint16_t)WIRE_ENCODE(sd, DIARC_ESTIMATE_LOAD_SD, base, 0, WIRE_MAX_U16),
+        .updating = estimator->updating,
+        .load_used = controller->armed && controller->kind == CONTROLLER_DIARC,
+        .load_at_bound = m_t <= load->low || m_t >= load->high,
+        .valve_saturated = out[SWING].saturated || out[WRIST].saturated,
+        .moving = controller->armed && (trajectory_moving(&controller->trajectory[SWING]) ||
+                                        trajectory_moving(&controller->trajectory[WRIST])),
+    };
+    struct can_frame_11bit frame = {.id = DIARC_ESTIMATE_FRAME_ID, .length = DIARC_ESTIMATE_LENGTH};
+    (void)diarc_estimate_pack(frame.data, &message, sizeof frame.data);
+    protect(ecu, TX_ESTIMATE, &frame);
+    return frame;
+}
+
+struct can_frame_11bit transmit_tracking(struct ecu *ecu)
+{
+    const uint8_t joint = ecu->next_joint;
+    ecu->next_joint = (uint8_t)((joint + 1u) % JOINTS);
+    const struct joint_output *const out = &ecu->controller.output[joint];
+    const int32_t error = WIRE_ENCODE(out->e1, DIARC_TRACKING_SWING_ERROR, 0, -WIRE_MAX_S20, WIRE_MAX_S20);
+    const int32_t reference =
+        WIRE_ENCODE(out->reference.q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
+    const struct diarc_tracking_t message = {
+        .mode = (uint8_t)ecu->mode,
+        .tracking_joint = joint,
+        .swing_error = error,
+        .wrist_error = error,
+        .swing_reference = reference,
+        .wrist_reference = reference,
+    };
+    struct can_frame_11bit frame = {.id = DIARC_TRACKING_FRAME_ID, .length = DIARC_TRACKING_LENGTH};
+    (void)diarc_tracking_pack(frame.data, &message, sizeof frame.data);
+    protect(ecu, TX_TRACKING, &frame);
+    return frame;
+}
+
+#define ENCODE_THETA(member, SIGNAL, base)                                                        \
+    message.theta_##member =                                                                      \
+        WIRE_ENCODE(value, DIARC_PARAMETERS_THETA_##SIGNAL, (base), -WIRE_MAX_S24, WIRE_MAX_S24); \
+    message.sd_##member = (uint16_t)WIRE_ENCODE(sd, DIARC_PARAMETERS_SD_##SIGNAL, (base), 0, WIRE_MAX_U16)
+
+struct can_frame_11bit transmit_parameter(struct ecu *ecu)
+{
+    const uint8_t k = ecu->next_parameter;
+    ecu->next_parameter = (uint8_t)((k + 1u) % THETA_FRAMES);
+    const struct estimator *const estimator = &ecu->controller.estimator;
+    const struct estimator_constants *const constants = &ecu->constants.estimator;
+    const bool mechanics = k < THETA_M;
+    const uint8_t h = (uint8_t)(k - THETA_M);
+    const scalar value = mechanics ? estimator->theta_m[k] : estimator->theta_h[h];
+    const scalar sd = mechanics ? estimator_sd_m(estimator, constants, (enum theta_m)k)
+                                : estimator_sd_h(estimator, constants, (enum theta_h)h);
+    const int8_t torque = base_torque(&ecu->bases);
+    const int8_t volume = base_volume(&ecu->bases);
+    const int8_t compliance = (int8_t)(-ecu->bases.pressure);
+    struct diarc_parameters_t message = {.mode = (uint8_t)ecu->mode, .parameter = k};
+    switch (k) {
+    case M_T:
+        ENCODE_THETA(m_t, M_T, torque);
+        break;
+    case J:
+        ENCODE_THETA(j, J, torque);
+        break;
+    case M2:
+        ENCODE_THETA(m2, M2, torque);
+        break;
+    case FV1:
+        ENCODE_THETA(fv1, FV1, torque);
+        break;
+    case FV2:
+        ENCODE_THETA(fv2, FV2, torque);
+        break;
+    case FC1:
+        ENCODE_THETA(fc1, FC1, torque);
+        break;
+    case FC2:
+        ENCODE_THETA(fc2, FC2, torque);
+        break;
+    case OM1:
+        ENCODE_THETA(om1_swing, OM1_SWING, torque);
+        break;
+    case OM2:
+        ENCODE_THETA(om1_wrist, OM1_WRIST, torque);
+        break;
+    case THETA_M + BETA_INVERSE:
+        ENCODE_THETA(beta_inverse, BETA_INVERSE, compliance);
+        break;
+    case THETA_M + OM2_SWING:
+        ENCODE_THETA(om2_swing, OM2_SWING, volume);
+        break;
+    case THETA_M + OM3_SWING:
+        ENCODE_THETA(om3_swing, OM3_SWING, volume);
+        break;
+    case THETA_M + OM2_WRIST:
+        ENCODE_THETA(om2_wrist, OM2_WRIST, volume);
+        break;
+    default:
+        ENCODE_THETA(om3_wrist, OM3_WRIST, volume);
+        break;
+    }
+    struct can_frame_11bit frame = {.id = DIARC_PARAMETERS_FRAME_ID, .length = DIARC_PARAMETERS_LENGTH};
+    (void)diarc_parameters_pack(frame.data, &message, sizeof frame.data);
+    protect(ecu, TX_PARAMETERS, &frame);
+    return frame;
+}
+
+struct can_frame_11bit transmit_timing(struct ecu *ecu)
+{
+    const uint8_t page = ecu->next_page;
+    ecu->next_page = (uint8_t)((page + 1u) % TIMING_PAGES);
+    const struct ecu_counters *const counters = &ecu->counters;
+    const struct diarc_timing_t message = {
+        .mode = (uint8_t)ecu->mode,
+        .timing_page = page,
+        .tick_time = counters->tick_time_us,
+        .late_ticks = counters->late_ticks,
+        .fault_code = (uint8_t)ecu->fault,
+        .dbc_hash = DIARC_DBC_HASH,
+        .lost_frames = ecu->receive.lost,
+        .e2e_errors = ecu->receive.refused,
+        .send_drops = counters->send_drops,
+        .refused_requests = counters->refused,
+        .last_refusal = (uint8_t)counters->last_refusal,
+        .period_us = (uint16_t)ecu->period_us,
+    };
+    struct can_frame_11bit frame = {.id = DIARC_TIMING_FRAME_ID, .length = DIARC_TIMING_LENGTH};
+    (void)diarc_timing_pack(frame.data, &message, sizeof frame.data);
+    protect(ecu, TX_TIMING, &frame);
+    return frame;
+}
