@@ -1,0 +1,166 @@
+/* diarc_ecu: the ECU as a Linux process. */
+#include <errno.h>
+#include <signal.h>
+#include <stdio.h>
+#include <string.h>
+
+#include "ecu/ecu.h"
+#include "ecu/parameters.h"
+#include "ports/linux/loop.h"
+#include "ports/linux/options.h"
+#include "ports/linux/realtime.h"
+#include "ports/linux/socketcan.h"
+#include "ports/linux/socketcand_client.h"
+
+#ifndef DIARC_VERSION
+#error "the build defines DIARC_VERSION, a string"
+#endif
+
+enum { EXIT_RUN_FAILED = 1, EXIT_WRONG_USE = 2 };
+
+/* The bus asked for at a socketcand server: the hub takes any name, a daemon must have this interface. */
+#define SOCKETCAND_CHANNEL "vcan0"
+
+/* Static: no heap, and too large for a stack that strict pace locks in memory. */
+static struct ecu the_ecu;
+static struct parameter_image the_image;
+static struct bus socketcan_bus;
+static struct socketcand_client socketcand_bus;
+
+/* Reads exactly one image; false after one line on stderr. */
+static bool read_image(const char *path, struct parameter_image *image)
+{
+    FILE *const file = fopen(path, "rb");
+    if (file == NULL) {
+        (void)fprintf(stderr, "diarc_ecu: --params %s: %s; expected a parameter image of %zu bytes\n", path,
+                      strerror(errno), sizeof image->bytes);
+        return false;
+    }
+    errno = 0;
+    const size_t count = fread(image->bytes, 1, sizeof image->bytes, file);
+    const int error = errno;
+    const bool failed = ferror(file) != 0;
+    const bool longer = fgetc(file) != EOF;
+    (void)fclose(file);
+    if (!failed && !longer && count == sizeof image->bytes) {
+        return true;
+    }
+    if (failed) {
+        (void)fprintf(stderr, "diarc_ecu: --params %s: %s; expected a parameter image of %zu bytes\n", path,
+                      strerror(error), sizeof image->bytes);
+    } else {
+        (void)fprintf(stderr,
+                      "diarc_ecu: --params %s: the file has %s%zu bytes, expected a parameter image of %zu\n",
+                      path, longer ? "more than " : "", count, sizeof image->bytes);
+    }
+    return false;
+}
+
+static struct bus *open_bus(const struct options *options)
+{
+    struct bus *const bus = options->is_tcp ? &socketcand_bus.bus : &socketcan_bus;
+    const bool open = options->is_tcp
+                          ? socketcand_open(&socketcand_bus, options->host, options->port, SOCKETCAND_CHANNEL)
+                          : socketcan_open(&socketcan_bus, options->bus);
+    if (!open) {
+        (void)fprintf(stderr, "diarc_ecu: %s\n", bus->message);
+        return NULL;
+    }
+    return bus;
+}
+
+static void request_realtime(const char *program)
+{
+    bool has_fifo;
+    bool has_locked_memory;
+    realtime_request(&has_fifo, &has_locked_memory);
+    if (!has_fifo || !has_locked_memory) {
+        (void)fprintf(stderr,
+                      "diarc_ecu: no permission for %s%s%s, so ticks may be late; permit with "
+                      "sudo setcap cap_sys_nice,cap_ipc_lock=ep %s or raise ulimit -r and -l\n",
+                      has_fifo ? "" : "SCHED_FIFO", !has_fifo && !has_locked_memory ? " and " : "",
+                      has_locked_memory ? "" : "locked memory", program);
+    }
+}
+
+static void print_stats(const struct loop_stats *loop, const struct bus_stats *bus)
+{
+    (void)printf("diarc_ecu: %llu ticks, %llu late, %llu stalled, %llu frames not sent, %llu receive errors, "
+                 "%llu frames lost in the socket buffer\n",
+                 (unsigned long long)loop->ticks, (unsigned long long)loop->late_ticks,
+                 (unsigned long long)loop->stalled_ticks, (unsigned long long)bus->send_drops,
+                 (unsigned long long)bus->receive_errors, (unsigned long long)bus->receive_drops);
+}
+
+static int run(const struct options *options, const char *program)
+{
+    if (options->params_path != NULL && !read_image(options->params_path, &the_image)) {
+        return EXIT_WRONG_USE;
+    }
+    const struct parameter_image *const image = options->params_path != NULL ? &the_image : NULL;
+    uint16_t entry = 0;
+    const enum ecu_status status = ecu_init(&the_ecu, image, options->period_us, &entry);
+    if (status != ECU_OK) {
+        (void)fprintf(stderr, "diarc_ecu: %s%s%s%s%s\n", image != NULL ? options->params_path : "",
+                      image != NULL ? ": " : "", ecu_status_text(status),
+                      status == ECU_PARAMETER_RANGE ? ": " : "",
+                      status == ECU_PARAMETER_RANGE ? parameter_name(entry) : "");
+        return EXIT_WRONG_USE;
+    }
+    struct bus *const bus = open_bus(options);
+    if (bus == NULL) {
+        return EXIT_WRONG_USE;
+    }
+    if (options->pace == PACE_STRICT) {
+        request_realtime(program);
+    }
+    if (!options->quiet) {
+        (void)printf("diarc_ecu " DIARC_VERSION " on %s, %s pace, %lu us\n", options->bus,
+                     pace_name(options->pace), (unsigned long)options->period_us);
+    }
+
+    struct loop_stats stats;
+    int exit_status = 0;
+    const enum loop_end end = loop_run(options->pace, options->period_us, &the_ecu, bus, &stats);
+    if (end == LOOP_FAILED) {
+        (void)fprintf(stderr, "diarc_ecu: cannot make a timer: %s\n", strerror(errno));
+        exit_status = EXIT_RUN_FAILED;
+    }
+    if (end == LOOP_BUS_DOWN) {
+        (void)fprintf(stderr, "diarc_ecu: %s\n", bus->message);
+        exit_status = bus->state == BUS_REFUSED ? EXIT_WRONG_USE : EXIT_RUN_FAILED;
+    }
+    const bool delivered = bus->close(bus->port.context);
+    if (end == LOOP_STOPPED && !(delivered && stats.shutdown_sent)) {
+        (void)fputs(
+            "diarc_ecu: the last valve frame (zero, disabled) could not be sent; the valves close at the "
+            "timeout of their node\n",
+            stderr);
+        exit_status = EXIT_RUN_FAILED;
+    }
+    if (!options->quiet) {
+        print_stats(&stats, &bus->stats);
+    }
+    return exit_status;
+}
+
+int main(int argc, char *argv[])
+{
+    /* A reader of our output that goes away must not stop the ECU with its valves open. */
+    (void)signal(SIGPIPE, SIG_IGN);
+    (void)setvbuf(stdout, NULL, _IOLBF, 0);
+    struct options options;
+    switch (options_parse(argc, argv, &options)) {
+    case OPTIONS_HELP:
+        options_print_help();
+        return 0;
+    case OPTIONS_VERSION:
+        (void)puts("diarc_ecu " DIARC_VERSION);
+        return 0;
+    case OPTIONS_ERROR:
+        return EXIT_WRONG_USE;
+    case OPTIONS_RUN:
+        break;
+    }
+    return run(&options, argv[0]);
+}
