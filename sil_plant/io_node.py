@@ -1,0 +1,210 @@
+"""The joint I/O node as the bus sees it: samples at SYNC, drives the valves, keeps its own watch on the ECU.
+
+The node owns the plant. It integrates from SYNC to SYNC and never looks at a wall clock: a valve command
+takes effect at a fixed delay after the SYNC of its tick, wherever it was computed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from sil_plant import frames, protocol
+from sil_plant.frames import E2E_STATES, get, intact, protect, put, quantise, write_header
+from sil_plant.machine import Machine
+from sil_plant.plant import P_SWING, STATES, XV, PlantParameters, integrate
+
+SENSOR_FRAMES = 3
+_ANGLE_LIMIT = 8388607
+_PRESSURE_LIMIT = 65534  # 65535 means invalid
+_SPOOL_LIMIT = 32767
+
+# Places in Node.count
+TICK, SYNC_LAST, SYNC_LOST, COMMAND_AGE, COMMAND_NEW, E2E_REFUSED, VALVE_COUNTER, TIMED_OUT = range(8)
+
+
+class NodeLayout(NamedTuple):
+    """Identifiers, bit layouts and scales from the DBC, for compiled code."""
+
+    encoders_id: int
+    pressures_id: np.ndarray
+    valves_id: int
+    angles: np.ndarray
+    pressures: np.ndarray
+    valves: np.ndarray
+    angle_step: float
+    pressure_step: float
+    spool_step: float
+    command_step: float
+
+
+class NodeTiming(NamedTuple):
+    """Times of the node."""
+
+    period_s: float
+    delay_s: float
+    timeout_ticks: int
+
+
+class Node(NamedTuple):
+    """State of node and plant; arrays are changed in place.
+
+    Attributes
+    ----------
+    y : np.ndarray
+        Plant state, shape (12,).
+    u : np.ndarray
+        Set-points in effect, then the ones that wait for their delay; shape (2, 2).
+    load : np.ndarray
+        Load at the tip, kg, shape (1,).
+    count : np.ndarray
+        Integers named by the constants of this module.
+    scratch : np.ndarray
+        Work space of the integrator.
+    """
+
+    y: np.ndarray
+    u: np.ndarray
+    load: np.ndarray
+    count: np.ndarray
+    scratch: np.ndarray
+
+
+def node_layout() -> NodeLayout:
+    """Read what the node needs from the DBC."""
+    pressures = ("BorePressure", "AnnulusPressure", "SpoolPosition")
+    return NodeLayout(
+        encoders_id=protocol.frame_id("ENCODERS"),
+        pressures_id=np.array(
+            [protocol.frame_id("PRESSURES_SWING"), protocol.frame_id("PRESSURES_WRIST")], dtype=np.int64
+        ),
+        valves_id=protocol.frame_id("VALVES"),
+        angles=protocol.layout("ENCODERS", ("SwingAngle", "WristAngle")),
+        pressures=protocol.layout("PRESSURES_SWING", pressures),
+        valves=protocol.layout(
+            "VALVES", ("SwingSpool", "WristSpool", "SwingControl", "WristControl", "SyncCounter")
+        ),
+        angle_step=protocol.scale("ENCODERS", "SwingAngle"),
+        pressure_step=protocol.scale("PRESSURES_SWING", "BorePressure") * 1e5,
+        spool_step=protocol.scale("PRESSURES_SWING", "SpoolPosition") / 100.0,
+        command_step=protocol.scale("VALVES", "SwingSpool") / 100.0,
+    )
+
+
+def node_timing(machine: Machine, period_s: float) -> NodeTiming:
+    """Times of the node for a tick of ``period_s``."""
+    return NodeTiming(
+        period_s=period_s,
+        delay_s=min(machine["io.command_delay_s"], period_s),
+        timeout_ticks=max(1, round(machine["io.valve_timeout_s"] / period_s)),
+    )
+
+
+def make_node(y: np.ndarray, load_kg: float) -> Node:
+    """A node at rest that has heard nothing yet."""
+    count = np.zeros(8, dtype=np.int64)
+    count[VALVE_COUNTER] = -1
+    return Node(
+        y=y.copy(),
+        u=np.zeros((2, 2)),
+        load=np.array([load_kg]),
+        count=count,
+        scratch=np.zeros((5, STATES)),
+    )
+
+
+@njit(cache=True)
+def advance_one_period(node: Node, plant: PlantParameters, timing: NodeTiming) -> None:
+    """Integrate over one period: the old set-points up to the delay, then the new ones."""
+    integrate(node.y, node.u[0], node.load[0], plant, timing.delay_s, node.scratch)
+    count = node.count
+    if count[COMMAND_NEW]:
+        count[COMMAND_NEW] = 0
+        count[COMMAND_AGE] = 0
+        node.u[0, 0] = node.u[1, 0]
+        node.u[0, 1] = node.u[1, 1]
+    else:
+        count[COMMAND_AGE] += 1
+        if count[COMMAND_AGE] > timing.timeout_ticks:
+            count[TIMED_OUT] = 1
+            node.u[0, 0] = 0.0
+            node.u[0, 1] = 0.0
+    integrate(node.y, node.u[0], node.load[0], plant, timing.period_s - timing.delay_s, node.scratch)
+
+
+@njit(cache=True)
+def node_sync(
+    node: Node,
+    plant: PlantParameters,
+    layout: NodeLayout,
+    timing: NodeTiming,
+    sync_counter: int,
+    noise: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Answer SYNC: bring the plant to this instant, sample, and pack the sensor frames.
+
+    Parameters
+    ----------
+    node, plant, layout, timing
+        The node.
+    sync_counter : int
+        1..240; missing ones are integrated over and counted.
+    noise : np.ndarray
+        This tick's sensor noise: two angles (rad), four pressures (Pa); shape (6,).
+    out : np.ndarray
+        Written: three frame rows, shape (3, 16).
+    """
+    count = node.count
+    if count[SYNC_LAST] > 0:
+        periods = (sync_counter - count[SYNC_LAST]) % 240
+        if periods == 0:
+            periods = 240
+        count[SYNC_LOST] += periods - 1
+        for _ in range(periods):
+            advance_one_period(node, plant, timing)
+        count[TICK] += periods
+    count[SYNC_LAST] = sync_counter
+
+    # The E2E counter of a sensor frame says which SYNC it answers.
+    counter = (sync_counter - 1) % E2E_STATES
+    y = node.y
+    write_header(out[0], layout.encoders_id, 8)
+    for i in range(2):
+        raw = quantise(y[i] + noise[i], layout.angle_step, -_ANGLE_LIMIT, _ANGLE_LIMIT)
+        put(out[0], layout.angles[i, 0], layout.angles[i, 1], raw)
+    protect(out[0], counter)
+    for i in range(2):
+        row = out[1 + i]
+        write_header(row, layout.pressures_id[i], 8)
+        for k in range(2):
+            pressure = y[P_SWING + 2 * i + k] + noise[2 + 2 * i + k]
+            raw = quantise(pressure, layout.pressure_step, 0, _PRESSURE_LIMIT)
+            put(row, layout.pressures[k, 0], layout.pressures[k, 1], raw)
+        raw = quantise(y[XV + i], layout.spool_step, -_SPOOL_LIMIT, _SPOOL_LIMIT)
+        put(row, layout.pressures[2, 0], layout.pressures[2, 1], raw)
+        protect(row, counter)
+
+
+@njit(cache=True)
+def node_frame(node: Node, layout: NodeLayout, row: np.ndarray) -> None:
+    """Take a frame from the bus: valve commands count, all others are not for the node."""
+    if frames.frame_id(row) != layout.valves_id:
+        return
+    count = node.count
+    counter = row[frames.DATA + 1] & 0x0F
+    if not intact(row) or counter >= E2E_STATES or counter == count[VALVE_COUNTER]:
+        count[E2E_REFUSED] += 1
+        return
+    count[VALVE_COUNTER] = counter
+    fields = layout.valves
+    if get(row, fields[4, 0], fields[4, 1], 0) != count[SYNC_LAST]:
+        count[E2E_REFUSED] += 1  # an answer to another SYNC
+        return
+    for i in range(2):
+        enabled = get(row, fields[2 + i, 0], fields[2 + i, 1], 0) == 7
+        raw = get(row, fields[i, 0], fields[i, 1], 1)
+        node.u[1, i] = min(max(raw * layout.command_step, -1.0), 1.0) if enabled else 0.0
+    count[COMMAND_NEW] = 1
