@@ -17,6 +17,8 @@ from sil_plant.machine import Machine
 from sil_plant.plant import P_SWING, STATES, XV, PlantParameters, integrate
 
 SENSOR_FRAMES = 3
+IO_HEARTBEAT_S = 0.1
+_NMT_OPERATIONAL = 5
 _ANGLE_LIMIT = 8388607
 _PRESSURE_LIMIT = 65534  # 65535 means invalid
 _SPOOL_LIMIT = 32767
@@ -91,6 +93,11 @@ def node_layout() -> NodeLayout:
         spool_step=protocol.scale("PRESSURES_SWING", "SpoolPosition") / 100.0,
         command_step=protocol.scale("VALVES", "SwingSpool") / 100.0,
     )
+
+
+def heartbeat_row() -> np.ndarray:
+    """The node's heartbeat frame."""
+    return frames.to_row(protocol.frame_id("HEARTBEAT_IO"), bytes((_NMT_OPERATIONAL,)))
 
 
 def node_timing(machine: Machine, period_s: float) -> NodeTiming:

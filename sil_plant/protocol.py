@@ -15,6 +15,7 @@ DBC_PATH = ROOT / "can_protocol" / "diarc.dbc"
 
 SYNC_ID = 0x080
 NMT_ID = 0x000
+BIT_RATE = 1_000_000
 
 
 def dbc_hash(path: Path = DBC_PATH) -> int:
@@ -52,6 +53,21 @@ def layout(name: str, signals: tuple[str, ...]) -> np.ndarray:
             raise ConfigError(f"{DBC_PATH}: {name}.{signal_name} is not little-endian")
         rows.append((signal.start, signal.length, int(signal.is_signed)))
     return np.array(rows, dtype=np.int64)
+
+
+def worst_case_bits(length: int) -> int:
+    """Bits of a classic frame with an 11-bit identifier on the wire: worst stuffing, and the gap after it."""
+    return 8 * length + 44 + (34 + 8 * length - 1) // 4 + 3
+
+
+def worst_case_bus_load() -> float:
+    """Share of the bit rate that the cyclic frames of the DBC need, 0..1."""
+    bits_per_s = sum(
+        worst_case_bits(message.length) / (message.cycle_time * 1e-3)
+        for message in database().messages
+        if message.cycle_time
+    )
+    return float(bits_per_s / BIT_RATE)
 
 
 def scale(name: str, signal: str) -> float:

@@ -16,6 +16,7 @@ from sil_plant import protocol
 from sil_plant.frames import DATA, FRAME_BYTES, frame_id, get, intact, protect, put, quantise, to_row
 from sil_plant.io_node import (
     SENSOR_FRAMES,
+    SYNC_LOST,
     Node,
     NodeLayout,
     NodeTiming,
@@ -25,7 +26,7 @@ from sil_plant.io_node import (
     node_sync,
     node_timing,
 )
-from sil_plant.machine import JOINT_NAMES, Machine
+from sil_plant.machine import Machine
 from sil_plant.plant import STATES, PlantParameters, plant_parameters, state_at_rest
 from sil_plant.scenario import Scenario, moves
 
@@ -421,6 +422,6 @@ def trace_sha256(record: Record, ticks: int) -> str:
     return digest.hexdigest()
 
 
-def joint_label(joint: int) -> str:
-    """Name of a joint by its number."""
-    return JOINT_NAMES[joint]
+def sync_lost(session: Session) -> int:
+    """SYNC frames that the node missed."""
+    return int(session.node.count[SYNC_LOST])

@@ -20,7 +20,7 @@ enum slow_phase {
     PHASE_TRACKING = 3,
     PHASE_PARAMETER = 5,
     PHASE_TIMING = 7,
-    PHASE_TRACKING_2 = 9
+    PHASE_TRACKING_2 = 8
 };
 
 static void count_u16(uint16_t *counter)

@@ -1,0 +1,38 @@
+"""Start-up of the project's scripts with nothing but the standard library: the right Python, the right path."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+NEEDED = ("numpy", "numba", "can", "cantools", "rich")
+
+
+def enter(script: str) -> None:
+    """Continue in the project's environment, or say which command prepares it and exit with status 2.
+
+    Parameters
+    ----------
+    script : str
+        ``__file__`` of the script that was started.
+    """
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if not missing:
+        return
+    python = ROOT / ".venv" / "bin" / "python"
+    if python.exists() and "DIARC_ENTERED" not in os.environ:
+        os.environ["DIARC_ENTERED"] = "1"
+        os.execv(python, [str(python), script, *sys.argv[1:]])
+    print(
+        f"{Path(script).name}: {missing[0]} is missing here; prepare the project's environment once: make setup",
+        file=sys.stderr,
+    )
+    sys.exit(2)
+
+
+def say(text: str) -> None:
+    """Write one line to standard error."""
+    print(text, file=sys.stderr, flush=True)

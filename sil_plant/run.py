@@ -1,0 +1,343 @@
+"""Run the simulated arm against the ECU: on a CAN bus, over TCP, or in this process.
+
+Examples
+--------
+  ./firmware/diarc_ecu vcan0 &  python sil_plant/run.py --load 2.5
+  python sil_plant/run.py --load 2.5 --bus tcp:127.0.0.1:29536 --ecu spawn
+  python sil_plant/run.py --load 2.5 --bus inproc --json result.json --csv trace.csv
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[0] = str(ROOT)
+
+from sil_plant.environment import enter, say  # noqa: E402
+
+enter(__file__)
+
+from rich.console import Console  # noqa: E402
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
+
+from sil_plant import bus_run, inproc, protocol, results, session  # noqa: E402
+from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port, parse_bus  # noqa: E402
+from sil_plant.config import ConfigError  # noqa: E402
+from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
+from sil_plant.scenario import (  # noqa: E402
+    DEFAULT_SCENARIO,
+    LONGEST_RUN_S,
+    Scenario,
+    check_scenario,
+    load_scenario,
+    with_load,
+)
+
+ECU_BINARY = ROOT / "firmware" / "diarc_ecu"
+PERIOD_US = 1000
+EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
+SPAWN_STOP_S = 5.0
+INPROC_CHUNK = 250
+
+
+class SpawnedEcu:
+    """An ECU process of ours.
+
+    Parameters
+    ----------
+    bus : str
+        The bus string it gets.
+    pace : str
+        Its ``--pace``.
+    params : Path
+        Its parameter image.
+    """
+
+    def __init__(self, bus: str, pace: str, params: Path) -> None:
+        if not ECU_BINARY.exists():
+            raise ConfigError(f"{ECU_BINARY.relative_to(ROOT)} is not built; build it: make firmware")
+        command = [str(ECU_BINARY), bus, "--pace", pace, "--quiet", "--params", str(params)]
+        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+
+    def check(self) -> None:
+        """Raise when the process has ended."""
+        status = self.process.poll()
+        if status is not None:
+            raise bus_run.EcuLostError(f"the ECU that was started has ended with status {status}")
+
+    def stop(self) -> None:
+        """End the process as its user would, and at last by force."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(SPAWN_STOP_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def parse_arguments(argv: list[str]) -> argparse.Namespace:
+    """Read the command line; a wrong one ends the program with status 2."""
+    parser = argparse.ArgumentParser(
+        prog="run.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--load", type=float, metavar="KG", help="load at the tip; default: the scenario's")
+    parser.add_argument(
+        "--bus", default="vcan0", metavar="BUS", help="vcan0 (default), can0, tcp:HOST:PORT, inproc"
+    )
+    parser.add_argument(
+        "--ecu", choices=("external", "spawn"), default="external", help="use an ECU that runs, or start one"
+    )
+    parser.add_argument(
+        "--pace", choices=("realtime", "strict", "lockstep"), help="of a spawned ECU; default realtime"
+    )
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="of the motion; default: the scenario's, 10"
+    )
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="of the sensor noise; default: the scenario's, 1"
+    )
+    parser.add_argument("--controller", choices=session.CONTROLLERS, default="diarc")
+    parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")
+    parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, metavar="FILE")
+    parser.add_argument(
+        "--scalar", choices=inproc.SCALARS, default="double", help="number type of the law, in process"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the trace, one row per tick")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
+    arguments = parser.parse_args(argv)
+    if arguments.pace and arguments.ecu != "spawn":
+        parser.error("--pace is the spawned ECU's: it goes with --ecu spawn")
+    return arguments
+
+
+def load_inputs(arguments: argparse.Namespace) -> tuple[Machine, Machine, Scenario, BusAddress]:
+    """Read and check everything a run needs: the ECU's machine, the plant's, the scenario, the bus."""
+    address = parse_bus(arguments.bus)
+    if address.kind == "inproc" and arguments.ecu == "spawn":
+        raise ConfigError("--ecu spawn needs a bus: --bus vcan0 or --bus tcp:127.0.0.1:29536")
+    if address.kind != "inproc" and arguments.scalar != "double":
+        raise ConfigError(
+            "--scalar is for --bus inproc; an ECU on a bus has the number type it was built with"
+        )
+    if arguments.arm != REFERENCE_ARM and address.kind != "inproc" and arguments.ecu != "spawn":
+        say("run.py: note: the ECU on the bus must have been started with this machine's --params")
+    machine = load_machine(arguments.arm)
+    scenario = load_scenario(arguments.scenario)
+    if arguments.load is not None:
+        if not arguments.load >= 0.0:
+            raise ConfigError(f"--load {arguments.load:g}: a load is 0 kg or more")
+        scenario = with_load(scenario, arguments.load)
+    if arguments.duration is not None:
+        if not 0.01 <= arguments.duration <= LONGEST_RUN_S:
+            raise ConfigError(f"--duration {arguments.duration:g}: 0.01 to {LONGEST_RUN_S:g} s is possible")
+        scenario = replace(scenario, duration_s=arguments.duration)
+    if arguments.seed is not None:
+        if arguments.seed < 0:
+            raise ConfigError(f"--seed {arguments.seed}: a whole number from 0 is needed")
+        scenario = replace(scenario, seed=arguments.seed)
+    check_scenario(scenario, machine)
+    plant_machine = with_changes(machine, scenario.plant, f"{arguments.scenario}: [plant]")
+    for path in (arguments.json, arguments.csv):
+        if path is not None and not path.resolve().parent.is_dir():
+            raise ConfigError(f"{path}: its folder does not exist")
+    return machine, plant_machine, scenario, address
+
+
+def compile_plant(machine: Machine, scenario: Scenario) -> None:
+    """Run a few ticks in memory, so that no compiling happens while a bus waits."""
+    from numba.core import config
+
+    cache = Path(config.CACHE_DIR) if config.CACHE_DIR else Path(session.__file__).parent / "__pycache__"
+    if not any(cache.glob("**/session.on_sync*.nbi")):
+        say("run.py: compiling the plant, once after installation (about 20 s) ...")
+    short = replace(scenario, duration_s=0.01)
+    try:
+        warm = session.make_session(machine, machine, with_load(short, 0.0), "diarc", 0, PERIOD_US * 1e-6)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
+    bus_run.warm_up(warm)
+
+
+def ignore_progress(tick: int) -> None:
+    """For runs that show none."""
+
+
+def run_in_process(run: session.Session, image: bytes, scalar: str, progress: Callable[[int], None]) -> None:
+    """Run the session with the firmware in this process."""
+    ecu = inproc.InprocEcu(image, PERIOD_US, scalar)
+    while inproc.run_inproc(run, ecu, INPROC_CHUNK) == INPROC_CHUNK:
+        progress(int(run.progress.index[session.TICK]))
+        bus_run.check_hash(run)
+
+
+def run_over_bus(
+    run: session.Session,
+    address: BusAddress,
+    arguments: argparse.Namespace,
+    image: bytes,
+    progress: Callable[[int], None],
+    started: Callable[[], None],
+) -> None:
+    """Run the session with an ECU on a bus, one of ours or one that is there."""
+    with ExitStack() as stack:
+        port = stack.enter_context(open_frame_port(address, host_hub=True))
+        bus = arguments.bus
+        if isinstance(port, HubPort):
+            bus = f"tcp:{address.host}:{port.hub.port}"
+            if not arguments.quiet and arguments.ecu == "external":
+                say(f"run.py: CAN over TCP at {bus}; start the ECU: ./firmware/diarc_ecu {bus}")
+        alive: Callable[[], None] = lambda: None  # noqa: E731
+        if arguments.ecu == "spawn":
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="diarc-"))
+            params = Path(folder) / "machine.params"
+            params.write_bytes(image)
+            ecu = SpawnedEcu(bus, arguments.pace or "realtime", params)
+            stack.callback(ecu.stop)
+            alive = ecu.check
+        stack.callback(bus_run.leave_ecu_safe, port)
+        bus_run.wait_for_ecu(port, bus, alive)
+        started()
+        bus_run.run_on_bus(run, port, progress, alive)
+
+
+def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run) -> results.Result:
+    """Write what was recorded and print the table."""
+    result = results.summarise(record, run)
+    if arguments.json:
+        results.write_json(arguments.json, result)
+    if arguments.csv:
+        results.write_csv(arguments.csv, record, run)
+    if not arguments.quiet:
+        print(results.table(result, protocol.worst_case_bus_load()))
+    return result
+
+
+def outcome(run: session.Session) -> str | None:
+    """What went wrong in a run that reached its end, or None."""
+    whole = run.monitor.whole
+    if whole[session.FAULTED]:
+        return (
+            f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
+        )
+    if whole[session.MODE] != session.MODE_RUN:
+        mode = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
+        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]})"
+    if whole[session.REFUSED]:
+        return (
+            f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
+        )
+    return None
+
+
+def main(argv: list[str]) -> int:
+    """Run the command line; the exit status."""
+    arguments = parse_arguments(argv)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        machine, plant_machine, scenario, address = load_inputs(arguments)
+        compile_plant(machine, scenario)
+        period_s = PERIOD_US * 1e-6
+        try:
+            run = session.make_session(
+                machine, plant_machine, scenario, arguments.controller, scenario.seed, period_s
+            )
+        except ValueError as error:
+            raise ConfigError(f"{error} with the supply of {machine.name}") from error
+        image = parameter_image(machine)
+    except (ConfigError, BusError) as error:
+        say(f"run.py: {error}")
+        return EXIT_WRONG_USE
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+    status, problem = 0, None
+    clock = [time.perf_counter()]
+    console = Console(stderr=True)
+    show = console.is_terminal and not arguments.quiet
+    bar = Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
+        TimeRemainingColumn(), console=console, transient=True, disable=not show,
+    )  # fmt: skip
+    with bar:
+        task = bar.add_task("arm moving", total=len(run.noise))
+        progress: Callable[[int], None] = (
+            (lambda tick: bar.update(task, completed=tick)) if show else ignore_progress
+        )
+        try:
+            if address.kind == "inproc":
+                run_in_process(run, image, arguments.scalar, progress)
+            else:
+                run_over_bus(
+                    run,
+                    address,
+                    arguments,
+                    image,
+                    progress,
+                    lambda: clock.__setitem__(0, time.perf_counter()),
+                )
+        except (ConfigError, BusError, bus_run.EcuMissingError) as error:
+            status, problem = EXIT_WRONG_USE, str(error)
+        except bus_run.EcuLostError as error:
+            status, problem = EXIT_FAILED, str(error)
+        except KeyboardInterrupt:
+            bus_run.close_valves(run)
+            status, problem = (
+                EXIT_INTERRUPTED,
+                "interrupted; the valves are closed, what was recorded is kept",
+            )
+    wall_s = time.perf_counter() - clock[0]
+
+    ticks = int(run.progress.index[session.TICK])
+    if status == 0:
+        problem = outcome(run)
+        status = EXIT_FAILED if problem else 0
+    if ticks:
+        figures = results.Run(
+            controller=arguments.controller,
+            arm=machine.name,
+            scenario=scenario.name,
+            seed=scenario.seed,
+            bus=arguments.bus,
+            period_s=period_s,
+            ticks=ticks,
+            lost_frames=int(run.monitor.whole[session.LOST] + session.sync_lost(run)),
+            wall_s=wall_s,
+            load_est_kg=float(run.monitor.load[0]),
+        )
+        try:
+            write_outputs(arguments, run.record, figures)
+        except ConfigError as error:
+            say(f"run.py: {error}")
+            status = status or EXIT_WRONG_USE
+    if problem:
+        say(f"run.py: {problem}")
+    late = int(run.monitor.whole[session.LATE])
+    if late and not arguments.quiet:
+        say(
+            f"run.py: note: {late} ticks ended without all sensor frames, because this machine paused the plant for "
+            "longer than the ECU waits; the trace differs from an undisturbed run's"
+        )
+    return status
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Treat SIGTERM as Ctrl-C: the run ends in order."""
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
