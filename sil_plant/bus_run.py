@@ -19,7 +19,6 @@ from sil_plant.session import (
     NMT_STOP,
     OUT_ROWS,
     REQUEST_STANDBY,
-    RUN_REQUEST_S,
     TICK,
     Session,
     motion_frame,
@@ -111,7 +110,7 @@ def run_on_bus(
     out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     heartbeat_id = protocol.frame_id("HEARTBEAT_ECU")
     period_s = session.timing.period_s
-    check_tick = round(RUN_REQUEST_S / period_s)
+    check_tick = session.timeline.run_request
     heartbeat_ticks = max(1, round(IO_HEARTBEAT_S / period_s))
     heartbeat = from_row(heartbeat_row())
     while True:
@@ -167,7 +166,7 @@ def warm_up(session: Session) -> None:
 def close_valves(session: Session) -> None:
     """What the node does without SYNC: it goes on by its own clock until its valves are closed."""
     for _ in range(session.timing.timeout_ticks + 2):
-        advance_one_period(session.node, session.plant, session.timing)
+        advance_one_period(session.node, session.plant, session.timing, session.errors, 0.0)
 
 
 def leave_ecu_safe(port: FramePort) -> None:

@@ -6,6 +6,7 @@ takes effect at a fixed delay after the SYNC of its tick, wherever it was comput
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,17 @@ class NodeLayout(NamedTuple):
     command_step: float
 
 
+class NodeErrors(NamedTuple):
+    """What sensors, valves and frames do wrong; zeros for the paper's plant."""
+
+    encoder_step: float
+    pressure_gain: np.ndarray  # (4,)
+    pressure_offset: np.ndarray  # (4,), Pa
+    hysteresis: float
+    jitter_s: float
+    frame_loss: float
+
+
 class NodeTiming(NamedTuple):
     """Times of the node."""
 
@@ -58,7 +70,8 @@ class Node(NamedTuple):
     y : np.ndarray
         Plant state, shape (12,).
     u : np.ndarray
-        Set-points in effect, then the ones that wait for their delay; shape (2, 2).
+        Set-points in effect, then the ones that wait for their delay, then what hysteresis lets the spools
+        follow; shape (3, 2).
     load : np.ndarray
         Load at the tip, kg, shape (1,).
     count : np.ndarray
@@ -95,6 +108,20 @@ def node_layout() -> NodeLayout:
     )
 
 
+def node_errors(machine: Machine, seed: int) -> NodeErrors:
+    """Sensor errors of a machine; their signs follow from the seed."""
+    signs = np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[2]).choice([-1.0, 1.0], (2, 4))
+    bits = machine["effects.encoder_bits"]
+    return NodeErrors(
+        encoder_step=2.0 * np.pi / 2.0**bits if bits > 0.0 else 0.0,
+        pressure_gain=1.0 + machine["effects.pressure_gain_error"] * signs[0],
+        pressure_offset=machine["effects.pressure_offset_Pa"] * signs[1],
+        hysteresis=machine["effects.hysteresis"],
+        jitter_s=machine["effects.sync_jitter_s"],
+        frame_loss=machine["effects.frame_loss"],
+    )
+
+
 def heartbeat_row() -> np.ndarray:
     """The node's heartbeat frame."""
     return frames.to_row(protocol.frame_id("HEARTBEAT_IO"), bytes((_NMT_OPERATIONAL,)))
@@ -115,7 +142,7 @@ def make_node(y: np.ndarray, load_kg: float) -> Node:
     count[VALVE_COUNTER] = -1
     return Node(
         y=y.copy(),
-        u=np.zeros((2, 2)),
+        u=np.zeros((3, 2)),
         load=np.array([load_kg]),
         count=count,
         scratch=np.zeros((5, STATES)),
@@ -123,9 +150,28 @@ def make_node(y: np.ndarray, load_kg: float) -> Node:
 
 
 @njit(cache=True)
-def advance_one_period(node: Node, plant: PlantParameters, timing: NodeTiming) -> None:
-    """Integrate over one period: the old set-points up to the delay, then the new ones."""
-    integrate(node.y, node.u[0], node.load[0], plant, timing.delay_s, node.scratch)
+def follow(node: Node, hysteresis: float) -> None:
+    """Let the spools follow the set-points in effect, with play."""
+    for i in range(2):
+        low, high = node.u[0, i] - 0.5 * hysteresis, node.u[0, i] + 0.5 * hysteresis
+        node.u[2, i] = min(max(node.u[2, i], low), high)
+
+
+@njit(cache=True)
+def advance_one_period(
+    node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
+) -> None:
+    """Integrate over one period: the old set-points up to the delay, then the new ones.
+
+    Parameters
+    ----------
+    node, plant, timing, errors
+        The node.
+    jitter : float
+        -1..1, how far the delay is off in this period, in units of the jitter.
+    """
+    delay_s = min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
+    integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
     count = node.count
     if count[COMMAND_NEW]:
         count[COMMAND_NEW] = 0
@@ -138,7 +184,8 @@ def advance_one_period(node: Node, plant: PlantParameters, timing: NodeTiming) -
             count[TIMED_OUT] = 1
             node.u[0, 0] = 0.0
             node.u[0, 1] = 0.0
-    integrate(node.y, node.u[0], node.load[0], plant, timing.period_s - timing.delay_s, node.scratch)
+    follow(node, errors.hysteresis)
+    integrate(node.y, node.u[2], node.load[0], plant, timing.period_s - delay_s, node.scratch)
 
 
 @njit(cache=True)
@@ -147,22 +194,32 @@ def node_sync(
     plant: PlantParameters,
     layout: NodeLayout,
     timing: NodeTiming,
+    errors: NodeErrors,
+    parked: bool,
     sync_counter: int,
     noise: np.ndarray,
     out: np.ndarray,
-) -> None:
+) -> int:
     """Answer SYNC: bring the plant to this instant, sample, and pack the sensor frames.
 
     Parameters
     ----------
-    node, plant, layout, timing
+    node, plant, layout, timing, errors
         The node.
+    parked : bool
+        The pump is off and the arm rests on its support: nothing moves, all chambers are at tank pressure.
     sync_counter : int
         1..240; missing ones are integrated over and counted.
     noise : np.ndarray
-        This tick's sensor noise: two angles (rad), four pressures (Pa); shape (6,).
+        This tick's noise, shape (12,): two angles (rad), four pressures (Pa), sampling and delay jitter (-1..1),
+        and for three sensor frames and the valve frame a number in 0..1 that decides whether it is lost.
     out : np.ndarray
-        Written: three frame rows, shape (3, 16).
+        Written: up to three frame rows, shape (3, 16).
+
+    Returns
+    -------
+    int
+        Rows written: three, less those that the bus loses.
     """
     count = node.count
     if count[SYNC_LAST] > 0:
@@ -171,7 +228,8 @@ def node_sync(
             periods = 240
         count[SYNC_LOST] += periods - 1
         for _ in range(periods):
-            advance_one_period(node, plant, timing)
+            if not parked:
+                advance_one_period(node, plant, timing, errors, noise[7])
         count[TICK] += periods
     count[SYNC_LAST] = sync_counter
 
@@ -180,19 +238,28 @@ def node_sync(
     y = node.y
     write_header(out[0], layout.encoders_id, 8)
     for i in range(2):
-        raw = quantise(y[i] + noise[i], layout.angle_step, -_ANGLE_LIMIT, _ANGLE_LIMIT)
+        angle = y[i] + y[2 + i] * noise[6] * errors.jitter_s + noise[i]
+        if errors.encoder_step > 0.0:
+            angle = errors.encoder_step * math.floor(angle / errors.encoder_step + 0.5)
+        raw = quantise(angle, layout.angle_step, -_ANGLE_LIMIT, _ANGLE_LIMIT)
         put(out[0], layout.angles[i, 0], layout.angles[i, 1], raw)
     protect(out[0], counter)
+    rows = 0 if noise[8] < errors.frame_loss else 1
     for i in range(2):
-        row = out[1 + i]
+        row = out[rows]
         write_header(row, layout.pressures_id[i], 8)
         for k in range(2):
-            pressure = y[P_SWING + 2 * i + k] + noise[2 + 2 * i + k]
+            n = 2 * i + k
+            true = plant.p_tank if parked else y[P_SWING + n]
+            pressure = true * errors.pressure_gain[n] + errors.pressure_offset[n] + noise[2 + n]
             raw = quantise(pressure, layout.pressure_step, 0, _PRESSURE_LIMIT)
             put(row, layout.pressures[k, 0], layout.pressures[k, 1], raw)
         raw = quantise(y[XV + i], layout.spool_step, -_SPOOL_LIMIT, _SPOOL_LIMIT)
         put(row, layout.pressures[2, 0], layout.pressures[2, 1], raw)
         protect(row, counter)
+        if noise[9 + i] >= errors.frame_loss:
+            rows += 1
+    return rows
 
 
 @njit(cache=True)

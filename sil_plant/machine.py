@@ -31,6 +31,22 @@ PLANT_RANGES: dict[str, tuple[float, float]] = {
     "io.command_delay_s": (0.0, 0.02),
     "io.valve_timeout_s": (1e-3, 1.0),
 }
+# What makes the plant less kind than the paper's; each by itself, none by default. docs/scenario.md explains them.
+EFFECTS: dict[str, tuple[float, float, float]] = {  # default, low, high
+    "effects.stribeck": (0.0, 0.0, 2.0),
+    "effects.stribeck_rate_rad_s": (0.02, 1e-3, 1.0),
+    "effects.hysteresis": (0.0, 0.0, 0.2),
+    "effects.air_bulk_low_Pa": (0.0, 0.0, 3e9),
+    "effects.air_bulk_high_Pa": (1.2e9, 1e8, 3e9),
+    "effects.air_pressure_Pa": (30e5, 1e4, 1e8),
+    "effects.supply_sag_Pa_s_m3": (0.0, 0.0, 1e12),
+    "effects.encoder_bits": (0.0, 0.0, 24.0),
+    "effects.pressure_gain_error": (0.0, 0.0, 0.1),
+    "effects.pressure_offset_Pa": (0.0, 0.0, 1e6),
+    "effects.sync_jitter_s": (0.0, 0.0, 5e-4),
+    "effects.frame_loss": (0.0, 0.0, 0.2),
+    "effects.viscosity_factor": (1.0, 0.1, 10.0),
+}
 BASE_KEYS = ("pressure_log2", "area_log2", "lever_log2")
 
 
@@ -132,6 +148,7 @@ def _ranges(table: ParameterTable) -> dict[str, tuple[float, float]]:
     for key, bounds in PLANT_RANGES.items():
         for joint in JOINT_NAMES if "*" in key else ("",):
             ranges[key.replace("*", joint)] = bounds
+    ranges |= {key: (low, high) for key, (_, low, high) in EFFECTS.items()}
     return ranges
 
 
@@ -193,11 +210,11 @@ def load_machine(path: Path) -> Machine:
         if key not in ranges:
             raise toml.error(key, "is not a key of a machine file; see sil_plant/arms/reference.toml")
         values[key] = toml.number(key, value, *ranges[key])
-    optional = {f"estimator.prior.{e.name.split('.')[2]}.value" for e in table.entries if ".prior." in e.name}
+    optional = set(EFFECTS) | {f"estimator.prior.{e.name.split('.')[2]}.value" for e in table.entries if ".prior." in e.name}
     for key in ranges:
         if key not in values and key not in optional:
             raise toml.error(key, "is missing")
-    values = _prior_values(values) | values
+    values = {key: default for key, (default, _, _) in EFFECTS.items()} | _prior_values(values) | values
     _check_relations(toml, values)
     return Machine(name=name, path=path, base=base, values=values)
 

@@ -62,6 +62,15 @@ class PlantParameters(NamedTuple):
     bulk_modulus: float
     p_supply: float
     p_tank: float
+    overlap: np.ndarray
+    friction_at_cylinder: float
+    lever_inverse: np.ndarray
+    stribeck: float
+    stribeck_rate: float
+    air_bulk_low: float
+    air_bulk_high: float
+    air_pressure: float
+    supply_sag: float
 
 
 def plant_parameters(machine: Machine) -> PlantParameters:
@@ -86,7 +95,7 @@ def plant_parameters(machine: Machine) -> PlantParameters:
         m2=machine["wrist.mass_kg"],
         J=machine["wrist.mass_kg"] * machine["wrist.link_length_m"] ** 2 / 3.0,
         coulomb_slope=machine["arm.coulomb_slope_s_rad"],
-        fv=pair("*.viscous_Nms_rad"),
+        fv=pair("*.viscous_Nms_rad") * machine["effects.viscosity_factor"],
         fc=pair("*.coulomb_Nm"),
         area1=math.pi / 4.0 * bore**2,
         area2=math.pi / 4.0 * (bore**2 - rod**2),
@@ -103,6 +112,15 @@ def plant_parameters(machine: Machine) -> PlantParameters:
         bulk_modulus=machine["oil.bulk_modulus_Pa"],
         p_supply=machine["supply.pressure_Pa"],
         p_tank=machine["supply.tank_Pa"],
+        overlap=pair("*.valve_overlap"),
+        friction_at_cylinder=machine["arm.friction_at_cylinder"],
+        lever_inverse=length(np.zeros(2)) / (a * b * np.sin(q0)),
+        stribeck=machine["effects.stribeck"],
+        stribeck_rate=machine["effects.stribeck_rate_rad_s"],
+        air_bulk_low=machine["effects.air_bulk_low_Pa"],
+        air_bulk_high=machine["effects.air_bulk_high_Pa"],
+        air_pressure=machine["effects.air_pressure_Pa"],
+        supply_sag=machine["effects.supply_sag_Pa_s_m3"],
     )
 
 
@@ -124,6 +142,27 @@ def end_contact(x: float, x_rate: float, stroke: float) -> float:
     if x > stroke:
         return min(-_END_STIFFNESS_N_M * (x - stroke) - _END_DAMPING_NS_M * x_rate, 0.0)
     return 0.0
+
+
+@njit(cache=True, inline="always")
+def bulk_modulus(pressure: float, p: PlantParameters) -> float:
+    """Bulk modulus, Pa: constant, or falling towards low pressure where air is dissolved in the oil."""
+    if p.air_bulk_low <= 0.0:
+        return p.bulk_modulus
+    share = max(pressure, 0.0) / (max(pressure, 0.0) + p.air_pressure)
+    return p.air_bulk_low + (p.air_bulk_high - p.air_bulk_low) * share
+
+
+@njit(cache=True, inline="always")
+def friction_torque(w: float, lever: float, i: int, p: PlantParameters) -> float:
+    """Friction of joint ``i`` at rate ``w``, N m: viscous, Coulomb, and a Stribeck peak at low speed."""
+    ratio = lever * p.lever_inverse[i] if p.friction_at_cylinder > 0.5 else 1.0
+    coulomb = p.fc[i]
+    if p.stribeck > 0.0:
+        slow = ratio * w / p.stribeck_rate
+        coulomb *= 1.0 + p.stribeck * math.exp(-slow * slow)
+    sign = (2.0 / math.pi) * math.atan(p.coulomb_slope * w)
+    return ratio * (ratio * p.fv[i] * w + coulomb * sign)
 
 
 @njit(cache=True)
@@ -157,21 +196,24 @@ def derivative(y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters,
         x_inside = min(max(x, 0.0), p.stroke[i])
         volume1 = p.dead_volume[i] + p.area1[i] * x_inside
         volume2 = p.dead_volume[i] + p.area2[i] * (p.stroke[i] - x_inside)
-        if xv >= 0.0:
-            flow1 = p.kv[i] * xv * signed_root(p.p_supply - p1)
-            flow2 = p.kv[i] * xv * signed_root(p2 - p.p_tank)
+        opening = xv - min(max(xv, -p.overlap[i]), p.overlap[i])
+        if opening >= 0.0:
+            supply = p.p_supply - p.supply_sag * p.kv[i] * opening * signed_root(p.p_supply - p1)
+            flow1 = p.kv[i] * opening * signed_root(supply - p1)
+            flow2 = p.kv[i] * opening * signed_root(p2 - p.p_tank)
         else:
-            flow1 = p.kv[i] * xv * signed_root(p1 - p.p_tank)
-            flow2 = p.kv[i] * xv * signed_root(p.p_supply - p2)
+            supply = p.p_supply + p.supply_sag * p.kv[i] * opening * signed_root(p.p_supply - p2)
+            flow1 = p.kv[i] * opening * signed_root(p1 - p.p_tank)
+            flow2 = p.kv[i] * opening * signed_root(supply - p2)
         leak = p.leakage[i] * (p1 - p2)
-        dy[P_SWING + 2 * i] = p.bulk_modulus / volume1 * (-p.area1[i] * x_rate + flow1 - leak)
-        dy[P_SWING + 2 * i + 1] = p.bulk_modulus / volume2 * (p.area2[i] * x_rate - flow2 + leak)
+        dy[P_SWING + 2 * i] = bulk_modulus(p1, p) / volume1 * (-p.area1[i] * x_rate + flow1 - leak)
+        dy[P_SWING + 2 * i + 1] = bulk_modulus(p2, p) / volume2 * (p.area2[i] * x_rate - flow2 + leak)
         dy[XV + i] = xv_rate
         dy[XV_RATE + i] = (
             p.valve_w[i] * p.valve_w[i] * (u[i] - xv) - 2.0 * p.valve_damping[i] * p.valve_w[i] * xv_rate
         )
         force = p1 * p.area1[i] - p2 * p.area2[i] + end_contact(x, x_rate, p.stroke[i])
-        friction = p.fv[i] * w + p.fc[i] * (2.0 / math.pi) * math.atan(p.coulomb_slope * w)
+        friction = friction_torque(w, lever, i, p)
         if i == 0:
             torque_1 = lever * force - friction
         else:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sil_plant.config import ConfigError
-from sil_plant.session import MODE_NAMES, PRELUDE_S, RUN_REQUEST_S, Record, trace_sha256
+from sil_plant.session import MODE_NAMES, Record, Timeline, trace_sha256
 
 LOAD_BAND_KG = 0.1
 AFTER_S = 1.0
@@ -54,21 +54,21 @@ class Run:
     scenario: str
     seed: int
     bus: str
-    period_s: float
+    timeline: Timeline
     ticks: int
     lost_frames: int
     wall_s: float
     load_est_kg: float
 
 
-def settling_time(record: Record, ticks: int, period_s: float) -> float | None:
+def settling_time(record: Record, ticks: int, timeline: Timeline) -> float | None:
     """From the start of motion until the load error stays within 0.1 kg; None if it never does."""
-    start = round(PRELUDE_S / period_s)
+    start = timeline.motion
     error = np.abs(record.load_est[start:ticks] - record.load_true[start:ticks])
     outside = np.nonzero(error > LOAD_BAND_KG)[0]
     if error.size == 0 or (outside.size and outside[-1] == error.size - 1):
         return None
-    return float((outside[-1] + 1) * period_s) if outside.size else 0.0
+    return float((outside[-1] + 1) * timeline.period_s) if outside.size else 0.0
 
 
 def summarise(record: Record, run: Run) -> Result:
@@ -82,8 +82,9 @@ def summarise(record: Record, run: Run) -> Result:
         What it was.
     """
     ticks = run.ticks
-    armed = min(round(RUN_REQUEST_S / run.period_s) + 1, ticks)
-    late = min(round((PRELUDE_S + AFTER_S) / run.period_s), ticks)
+    timeline = run.timeline
+    armed = min(timeline.run_request + 1, ticks)
+    late = min(timeline.motion + round(AFTER_S / timeline.period_s), ticks)
     error = record.state[:ticks, :2] - record.reference[:ticks]
     after, whole = np.abs(error[late:]), np.abs(error[armed:])
     speed = np.abs(record.state[late:ticks, 2:4])
@@ -93,12 +94,12 @@ def summarise(record: Record, run: Run) -> Result:
         for j in range(2)
     ]
     load_true = float(record.load_true[ticks - 1]) if ticks else 0.0
-    simulated_s = ticks * run.period_s
+    simulated_s = ticks * timeline.period_s
     return Result(
         load_true_kg=load_true,
         load_est_kg=run.load_est_kg,
         load_err_kg=run.load_est_kg - load_true,
-        load_settle_s=settling_time(record, ticks, run.period_s),
+        load_settle_s=settling_time(record, ticks, timeline),
         peak_err_rad=[float(v) for v in whole.max(axis=0)] if whole.size else [0.0, 0.0],
         peak_err_after_1s_rad=peak_after,
         rms_err_rad=[float(v) for v in np.sqrt((whole**2).mean(axis=0))] if whole.size else [0.0, 0.0],
@@ -162,7 +163,7 @@ def write_csv(path: Path, record: Record, run: Run) -> None:
     n = run.ticks
     columns = np.column_stack(
         [
-            np.arange(n) * run.period_s - PRELUDE_S,
+            (np.arange(n) - run.timeline.motion) * run.timeline.period_s,
             record.state[:n],
             record.command[:n],
             record.reference[:n],

@@ -20,6 +20,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
@@ -38,8 +39,10 @@ from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_im
 from sil_plant.scenario import (  # noqa: E402
     DEFAULT_SCENARIO,
     LONGEST_RUN_S,
+    PROFILE_NAMES,
     Scenario,
     check_scenario,
+    load_profile,
     load_scenario,
     with_load,
 )
@@ -110,6 +113,9 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("--controller", choices=session.CONTROLLERS, default="diarc")
     parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")
+    parser.add_argument(
+        "--profile", choices=PROFILE_NAMES, default="paper", help="how kind the plant is; default paper"
+    )
     parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, metavar="FILE")
     parser.add_argument(
         "--scalar", choices=inproc.SCALARS, default="double", help="number type of the law, in process"
@@ -123,8 +129,18 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     return arguments
 
 
-def load_inputs(arguments: argparse.Namespace) -> tuple[Machine, Machine, Scenario, BusAddress]:
-    """Read and check everything a run needs: the ECU's machine, the plant's, the scenario, the bus."""
+class Inputs(NamedTuple):
+    """Everything a run needs, checked."""
+
+    machine: Machine  # what the ECU believes
+    plant_machine: Machine  # what the plant is
+    scenario: Scenario
+    tare: bool
+    address: BusAddress
+
+
+def load_inputs(arguments: argparse.Namespace) -> Inputs:
+    """Read and check everything a run needs."""
     address = parse_bus(arguments.bus)
     if address.kind == "inproc" and arguments.ecu == "spawn":
         raise ConfigError("--ecu spawn needs a bus: --bus vcan0 or --bus tcp:127.0.0.1:29536")
@@ -134,7 +150,8 @@ def load_inputs(arguments: argparse.Namespace) -> tuple[Machine, Machine, Scenar
         )
     if arguments.arm != REFERENCE_ARM and address.kind != "inproc" and arguments.ecu != "spawn":
         say("run.py: note: the ECU on the bus must have been started with this machine's --params")
-    machine = load_machine(arguments.arm)
+    profile = load_profile(arguments.profile)
+    machine = with_changes(load_machine(arguments.arm), profile.machine, f"profile {profile.name}: [machine]")
     scenario = load_scenario(arguments.scenario)
     if arguments.load is not None:
         if not arguments.load >= 0.0:
@@ -149,23 +166,23 @@ def load_inputs(arguments: argparse.Namespace) -> tuple[Machine, Machine, Scenar
             raise ConfigError(f"--seed {arguments.seed}: a whole number from 0 is needed")
         scenario = replace(scenario, seed=arguments.seed)
     check_scenario(scenario, machine)
-    plant_machine = with_changes(machine, scenario.plant, f"{arguments.scenario}: [plant]")
+    plant_machine = with_changes(machine, profile.effects, f"profile {profile.name}: [effects]")
+    plant_machine = with_changes(plant_machine, scenario.plant, f"{arguments.scenario}: [plant]")
     for path in (arguments.json, arguments.csv):
         if path is not None and not path.resolve().parent.is_dir():
             raise ConfigError(f"{path}: its folder does not exist")
-    return machine, plant_machine, scenario, address
+    return Inputs(machine, plant_machine, scenario, profile.tare, address)
 
 
 def compile_plant(machine: Machine, scenario: Scenario) -> None:
     """Run a few ticks in memory, so that no compiling happens while a bus waits."""
     from numba.core import config
 
-    cache = Path(config.CACHE_DIR) if config.CACHE_DIR else Path(session.__file__).parent / "__pycache__"
-    if not any(cache.glob("**/session.on_sync*.nbi")):
+    if not any(Path(config.CACHE_DIR).glob("**/session.on_sync*.nbi")):
         say("run.py: compiling the plant, once after installation (about 20 s) ...")
     short = replace(scenario, duration_s=0.01)
     try:
-        warm = session.make_session(machine, machine, with_load(short, 0.0), "diarc", 0, PERIOD_US * 1e-6)
+        warm = session.make_session(machine, with_load(short, 0.0), "diarc", 0, PERIOD_US * 1e-6)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
@@ -248,12 +265,11 @@ def main(argv: list[str]) -> int:
     arguments = parse_arguments(argv)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        machine, plant_machine, scenario, address = load_inputs(arguments)
+        machine, plant_machine, scenario, tare, address = load_inputs(arguments)
         compile_plant(machine, scenario)
-        period_s = PERIOD_US * 1e-6
         try:
             run = session.make_session(
-                machine, plant_machine, scenario, arguments.controller, scenario.seed, period_s
+                plant_machine, scenario, arguments.controller, scenario.seed, PERIOD_US * 1e-6, tare
             )
         except ValueError as error:
             raise ConfigError(f"{error} with the supply of {machine.name}") from error
@@ -312,7 +328,7 @@ def main(argv: list[str]) -> int:
             scenario=scenario.name,
             seed=scenario.seed,
             bus=arguments.bus,
-            period_s=period_s,
+            timeline=run.timeline,
             ticks=ticks,
             lost_frames=int(run.monitor.whole[session.LOST] + session.sync_lost(run)),
             wall_s=wall_s,
@@ -326,7 +342,7 @@ def main(argv: list[str]) -> int:
     if problem:
         say(f"run.py: {problem}")
     late = int(run.monitor.whole[session.LATE])
-    if late and not arguments.quiet:
+    if late and not arguments.quiet and not run.errors.frame_loss:
         say(
             f"run.py: note: {late} ticks ended without all sensor frames, because this machine paused the plant for "
             "longer than the ECU waits; the trace differs from an undisturbed run's"

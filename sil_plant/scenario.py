@@ -217,3 +217,41 @@ def moves(scenario: Scenario) -> list[tuple[float, int, Segment]]:
             if not scenario.repeat:
                 break
     return sorted(found, key=lambda move: (move[0], move[1]))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How kind the plant is: what ECU and plant share, and what the plant alone has."""
+
+    name: str
+    tare: bool
+    machine: dict[str, float] = field(default_factory=dict)
+    effects: dict[str, float] = field(default_factory=dict)
+
+
+PROFILES = ROOT / "sil_plant" / "profiles"
+PROFILE_NAMES = ("paper", "realistic")
+
+
+def load_profile(name: str) -> Profile:
+    """Read a profile by its name.
+
+    Raises
+    ------
+    ConfigError
+        Naming file, line and key.
+    """
+    toml = TomlFile(PROFILES / f"{name}.toml")
+    data = toml.data
+    for key in data:
+        if key not in {"name", "tare", "machine", "effects"}:
+            raise toml.error(key, "is not a key of a profile")
+    return Profile(
+        name=name,
+        tare=bool(data.get("tare", False)),
+        machine={k: toml.number(f"machine.{k}", v, -1e12, 1e12) for k, v in flatten(data.get("machine", {}))},
+        effects={
+            f"effects.{k}": toml.number(f"effects.{k}", v, -1e12, 1e12)
+            for k, v in flatten(data.get("effects", {}))
+        },
+    )

@@ -1,7 +1,7 @@
 """One run: the I/O node, the master that commands the moves, and the record; the same compiled code on every bus.
 
-A run begins with a prelude at standstill: NMT start in the first tick, RUN requested at ``RUN_REQUEST_S``, and
-time zero of the scenario, when motion starts, at ``PRELUDE_S``.
+A run begins with a prelude at standstill, its :class:`Timeline`: NMT start in the first tick, the tare of the
+pressure sensors with the pump off where there is one, RUN, and then time zero of the scenario, when motion starts.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from sil_plant.io_node import (
     SENSOR_FRAMES,
     SYNC_LOST,
     Node,
+    NodeErrors,
     NodeLayout,
     NodeTiming,
     make_node,
+    node_errors,
     node_frame,
     node_layout,
     node_sync,
@@ -30,14 +32,33 @@ from sil_plant.machine import Machine
 from sil_plant.plant import STATES, PlantParameters, plant_parameters, state_at_rest
 from sil_plant.scenario import Scenario, moves
 
-RUN_REQUEST_S = 0.06
-PRELUDE_S = 0.1
+ARM_AFTER_S = 0.06  # of standstill, until RUN is requested
+MOVE_AFTER_S = 0.1  # of standstill, until motion starts
+TARE_REQUEST_S = 0.05
+PARKED_S = 0.25  # with the pump off, where the pressures are tared
 CONTROLLERS = ("pid", "diarc-noload", "diarc")
 
 ECU_NODE, IO_NODE = 1, 2
 NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129
-REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE = 1, 2, 3
-MODE_NAMES = {0: "INIT", 1: "STANDBY", 2: "RUN", 15: "FAULT"}
+REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE, REQUEST_TARE = 1, 2, 3, 5
+MODE_NAMES = {0: "INIT", 1: "STANDBY", 2: "RUN", 3: "TARE", 15: "FAULT"}
+# Estimated parameters in the order of the PARAMETERS frame: signal, and prior in a machine file.
+THETA = (
+    ("m_t", "m_t_kg"),
+    ("J", "J_kgm2"),
+    ("m2", "m2_kg"),
+    ("fv1", "fv_swing_Nms_rad"),
+    ("fv2", "fv_wrist_Nms_rad"),
+    ("fc1", "fc_swing_Nm"),
+    ("fc2", "fc_wrist_Nm"),
+    ("Om1_swing", "Om1_swing_Nm"),
+    ("Om1_wrist", "Om1_wrist_Nm"),
+    ("beta_inverse", "beta_inverse_1_Pa"),
+    ("Om2_swing", "Om2_swing_m3_s"),
+    ("Om3_swing", "Om3_swing_m3_s"),
+    ("Om2_wrist", "Om2_wrist_m3_s"),
+    ("Om3_wrist", "Om3_wrist_m3_s"),
+)
 MODE_RUN, MODE_FAULT = 2, 15
 
 MASTER_FRAMES_MOST = 4
@@ -60,6 +81,15 @@ OUT_ROWS = SENSOR_FRAMES + MASTER_FRAMES_MOST + 1
 ) = range(12)
 
 
+class Timeline(NamedTuple):
+    """The prelude, in ticks."""
+
+    period_s: float
+    parked: int  # pump off until here
+    run_request: int
+    motion: int  # time zero of the scenario
+
+
 class MonitorLayout(NamedTuple):
     """Identifiers, layouts and scales of what the ECU sends."""
 
@@ -75,6 +105,10 @@ class MonitorLayout(NamedTuple):
     load_step: float
     sd_step: float
     angle_step: float
+    parameters_id: int
+    parameters: np.ndarray
+    theta_step: np.ndarray
+    theta_sd_step: np.ndarray
 
 
 class Monitor(NamedTuple):
@@ -83,6 +117,8 @@ class Monitor(NamedTuple):
     whole: np.ndarray  # int64, places above
     load: np.ndarray  # estimate and its standard deviation, kg
     reference: np.ndarray  # swing, wrist, rad
+    theta: np.ndarray  # (14,), SI, nan until heard; order of THETA
+    theta_sd: np.ndarray
 
 
 class Schedule(NamedTuple):
@@ -124,6 +160,8 @@ class Session(NamedTuple):
     plant: PlantParameters
     layout: NodeLayout
     timing: NodeTiming
+    errors: NodeErrors
+    timeline: Timeline
     monitor_layout: MonitorLayout
     monitor: Monitor
     schedule: Schedule
@@ -163,6 +201,10 @@ def monitor_layout() -> MonitorLayout:
         load_step=protocol.scale("ESTIMATE", "Load"),
         sd_step=protocol.scale("ESTIMATE", "LoadSd"),
         angle_step=protocol.scale("TRACKING", "SwingReference"),
+        parameters_id=protocol.frame_id("PARAMETERS"),
+        parameters=protocol.layout("PARAMETERS", ("Parameter", "theta_m_t", "sd_m_t")),
+        theta_step=np.array([protocol.scale("PARAMETERS", f"theta_{name}") for name, _ in THETA]),
+        theta_sd_step=np.array([protocol.scale("PARAMETERS", f"sd_{name}") for name, _ in THETA]),
     )
 
 
@@ -189,21 +231,36 @@ def motion_frame(
     return row
 
 
-def make_schedule(scenario: Scenario, controller: str, period_s: float) -> Schedule:
+def make_timeline(period_s: float, tare: bool) -> Timeline:
+    """The prelude of a run, with or without the tare."""
+    parked_s = PARKED_S if tare else 0.0
+    return Timeline(
+        period_s=period_s,
+        parked=round(parked_s / period_s),
+        run_request=round((parked_s + ARM_AFTER_S) / period_s),
+        motion=round((parked_s + MOVE_AFTER_S) / period_s),
+    )
+
+
+def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Schedule:
     """Every frame of the master and every change of the load, by tick."""
+    period_s = timeline.period_s
     angle_step = protocol.scale("MOTION", "Target")
     rows = [(0, nmt_frame(NMT_START, node=0))]
     counter = 0
+    if timeline.parked:
+        rows.append((round(TARE_REQUEST_S / period_s), motion_frame(counter, REQUEST_TARE)))
+        counter += 1
     rows.append(
         (
-            round(RUN_REQUEST_S / period_s),
+            timeline.run_request,
             motion_frame(counter, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
         )
     )
     move_tick, move_joint, move_target, move_ticks = [], [], [], []
     for time_s, joint, segment in moves(scenario):
         counter += 1
-        tick = round((PRELUDE_S + time_s) / period_s)
+        tick = timeline.motion + round(time_s / period_s)
         duration_ms = round(segment.duration_s * 1e3)
         rows.append(
             (
@@ -217,7 +274,7 @@ def make_schedule(scenario: Scenario, controller: str, period_s: float) -> Sched
         move_joint.append(joint)
         move_target.append(quantise(segment.target_rad, angle_step, -8388607, 8388607) * angle_step)
         move_ticks.append(int(duration_ms * 1e-3 / period_s + 1e-9))
-    load_tick = [0] + [round((PRELUDE_S + step.time_s) / period_s) for step in scenario.load[1:]]
+    load_tick = [0] + [timeline.motion + round(step.time_s / period_s) for step in scenario.load[1:]]
     return Schedule(
         frame_tick=np.array([tick for tick, _ in rows], dtype=np.int64),
         frame_row=np.array([row for _, row in rows], dtype=np.uint8),
@@ -231,26 +288,36 @@ def make_schedule(scenario: Scenario, controller: str, period_s: float) -> Sched
 
 
 def sensor_noise(machine: Machine, seed: int, ticks: int) -> np.ndarray:
-    """Noise of two angles (rad) and four pressures (Pa) per tick, shape (ticks, 6); same seed, same bytes."""
-    angles, pressures = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(2))
+    """What chance does in each tick, shape (ticks, 12); same seed, same bytes, however long the run.
+
+    Columns: two angles (rad), four pressures (Pa), sampling and delay jitter (-1..1), and for three sensor frames
+    and the valve frame a number in 0..1 that decides whether it is lost.
+    """
+    angles, pressures, _, frames = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
     amplitude = machine["sensors.encoder_noise_rad"]
+    chance = frames.uniform(0.0, 1.0, (ticks, 6))
+    chance[:, :2] = 2.0 * chance[:, :2] - 1.0
     return np.hstack(
         [
             angles.uniform(-amplitude, amplitude, (ticks, 2)),
             pressures.normal(0.0, machine["sensors.pressure_noise_Pa"], (ticks, 4)),
+            chance,
         ]
     )
 
 
 def make_session(
-    machine: Machine, plant_machine: Machine, scenario: Scenario, controller: str, seed: int, period_s: float
+    plant_machine: Machine,
+    scenario: Scenario,
+    controller: str,
+    seed: int,
+    period_s: float,
+    tare: bool = False,
 ) -> Session:
     """Put a run together.
 
     Parameters
     ----------
-    machine : Machine
-        What the ECU believes; its limits hold for the moves.
     plant_machine : Machine
         What the plant is.
     scenario : Scenario
@@ -261,13 +328,16 @@ def make_session(
         Of the sensor noise.
     period_s : float
         The ECU's tick.
+    tare : bool
+        Begin with the pump off and tare the pressure sensors.
 
     Raises
     ------
     ValueError
         When the arm cannot hold the load at the start.
     """
-    ticks = round((PRELUDE_S + scenario.duration_s) / period_s) + 1
+    timeline = make_timeline(period_s, tare)
+    ticks = timeline.motion + round(scenario.duration_s / period_s) + 1
     plant = plant_parameters(plant_machine)
     load = scenario.load[0].load_kg
     y = state_at_rest(plant, np.array(scenario.start_pose_rad), load)
@@ -276,9 +346,17 @@ def make_session(
         plant=plant,
         layout=node_layout(),
         timing=node_timing(plant_machine, period_s),
+        errors=node_errors(plant_machine, seed),
+        timeline=timeline,
         monitor_layout=monitor_layout(),
-        monitor=Monitor(np.zeros(12, dtype=np.int64), np.zeros(2), np.zeros(2)),
-        schedule=make_schedule(scenario, controller, period_s),
+        monitor=Monitor(
+            whole=np.zeros(12, dtype=np.int64),
+            load=np.zeros(2),
+            reference=np.zeros(2),
+            theta=np.full(len(THETA), np.nan),
+            theta_sd=np.full(len(THETA), np.nan),
+        ),
+        schedule=make_schedule(scenario, controller, timeline),
         progress=Progress(np.zeros(4, dtype=np.int64), np.zeros((2, 4))),
         record=Record(
             state=np.zeros((ticks, STATES)),
@@ -355,8 +433,16 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
             out[rows, k] = schedule.frame_row[index[NEXT_FRAME], k]
         rows += 1
         index[NEXT_FRAME] += 1
-    node_sync(
-        node, session.plant, session.layout, session.timing, sync_counter, session.noise[tick], out[rows:]
+    rows += node_sync(
+        node,
+        session.plant,
+        session.layout,
+        session.timing,
+        session.errors,
+        tick < session.timeline.parked,
+        sync_counter,
+        session.noise[tick],
+        out[rows:],
     )
     for k in range(STATES):
         record.state[tick, k] = node.y[k]
@@ -368,7 +454,7 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     record.mode[tick] = session.monitor.whole[MODE]
     update_references(session, tick)
     index[TICK] = tick + 1
-    return rows + SENSOR_FRAMES
+    return rows
 
 
 @njit(cache=True)
@@ -377,7 +463,9 @@ def on_frame(session: Session, row: np.ndarray) -> None:
     layout, whole = session.monitor_layout, session.monitor.whole
     can_id = frame_id(row)
     if can_id == layout.valves_id:
-        node_frame(session.node, session.layout, row)
+        tick = session.progress.index[TICK]
+        if tick == 0 or session.noise[tick - 1, 11] >= session.errors.frame_loss:
+            node_frame(session.node, session.layout, row)
         if intact(row):
             whole[MODE] = row[DATA + 1] >> 4
             if whole[MODE] == MODE_FAULT:
@@ -397,6 +485,12 @@ def on_frame(session: Session, row: np.ndarray) -> None:
             session.monitor.reference[joint] = (
                 get(row, f[1 + joint, 0], f[1 + joint, 1], 1) * layout.angle_step
             )
+    elif can_id == layout.parameters_id and intact(row):
+        f = layout.parameters  # all parameters stand at the same place, each with its own scale
+        n = get(row, f[0, 0], f[0, 1], 0)
+        if n < session.monitor.theta.size:
+            session.monitor.theta[n] = get(row, f[1, 0], f[1, 1], 1) * layout.theta_step[n]
+            session.monitor.theta_sd[n] = get(row, f[2, 0], f[2, 1], 0) * layout.theta_sd_step[n]
     elif can_id == layout.timing_id and intact(row):
         f = layout.timing
         page = get(row, f[0, 0], f[0, 1], 0)

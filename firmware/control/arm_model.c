@@ -45,25 +45,28 @@ static void wrist_centrifugal_and_gravity(const struct arm *arm, const struct wr
     row->phi[COL_M2] += mul(SCALAR(0.5), mul(L2_s_w1_squared, arm->L1) + g_L2_c);
 }
 
-static void friction_and_offset(const struct arm *arm, scalar w, scalar friction_w, struct arm_row *row)
+/* F = fv x' + fc s(x') at a lever arm: torque R F, with x' = R q'. */
+static void friction_and_offset(const struct arm *arm, scalar w, scalar friction_w, scalar lever,
+                                struct arm_row *row)
 {
-    row->phi[COL_FV] = w;
-    row->phi[COL_FC] = coulomb_sign(arm, friction_w);
+    row->phi[COL_FV] = mul(mul(lever, lever), w);
+    row->phi[COL_FC] = mul(lever, coulomb_sign(arm, friction_w));
     row->phi[COL_OM] = SCALAR(-1);
 }
 
 void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
-               scalar friction_w, struct arm_row *row)
+               scalar friction_w, scalar lever, struct arm_row *row)
 {
     *row = (struct arm_row){0};
     if (i == WRIST) {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);
     }
-    friction_and_offset(arm, w[i], friction_w, row);
+    friction_and_offset(arm, w[i], friction_w, lever, row);
 }
 
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], struct arm_row *row)
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever,
+                          struct arm_row *row)
 {
     arm_momentum(arm, t, i, a, row); /* H is linear in the same columns: H q'' is the momentum of a */
     if (i == SWING) {                /* dH11/dq2 q1' q2', Eq 3 */
@@ -75,7 +78,7 @@ void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enu
     } else {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);
     }
-    friction_and_offset(arm, w[i], w[i], row);
+    friction_and_offset(arm, w[i], w[i], lever, row);
 }
 
 scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar theta[THETA_M])

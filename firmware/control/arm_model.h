@@ -30,6 +30,7 @@ struct arm {
     scalar I1;          /* swing inertia about its axis, kg m^2 */
     scalar g;           /* gravity, m/s^2 */
     gain coulomb_slope; /* s(w) = (2/pi) atan(slope w), s/rad */
+    scalar friction_at_cylinder; /* 0: at the joint; 1: at the cylinder, torques given at q = 0 */
 };
 
 /* Wrist angle's functions, computed once and shared. */
@@ -56,13 +57,16 @@ void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint 
                   struct arm_row *row);
 
 /* All terms of row i but the momentum's rate and R F: Coriolis and gravity, friction, offset.
- * friction_w, rad/s, is the speed that friction's sign is taken of. */
+ * friction_w, rad/s, is the speed that friction's sign is taken of; lever, the lever arm over that at q = 0,
+ * where friction acts at the cylinder, else 1. */
 void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
-               scalar friction_w, struct arm_row *row);
+               scalar friction_w, scalar lever, struct arm_row *row);
 
-/* phi2(q, q', q''), Eq 14: row i of the inverse dynamics; phi' theta + known = R F. a in rad/s^2. */
+/* phi2(q, q', q''), Eq 14: row i of the inverse dynamics; phi' theta + known = R F. a in rad/s^2;
+ * lever as above. */
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], struct arm_row *row);
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever,
+                          struct arm_row *row);
 
 /* phi' theta + known, N m per unit. */
 scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar theta[THETA_M]);

@@ -68,9 +68,12 @@ static void estimate(struct controller *controller, const struct machine *machin
         sample->reference_w[i] = controller->output[i].reference.w;
         sample->cylinder[i] = cylinder_at(cylinder, &constants->cylinder[i], measured->q[i]);
         sample->force[i] = cylinder_force(&constants->cylinder[i], p);
-        const bool extending = measured->spool[i] >= SCALAR(0);
-        sample->flow[i] = mul(measured->spool[i],
-                              valve_gain(cylinder, &machine->supply, &sample->cylinder[i], p, extending)) -
+        sample->lever[i] = machine->arm.friction_at_cylinder > SCALAR(0.5)
+                               ? mul(sample->cylinder[i].R, constants->cylinder[i].lever_inverse)
+                               : SCALAR(1);
+        const scalar opening = valve_opening(cylinder, measured->spool[i]);
+        const bool extending = opening >= SCALAR(0);
+        sample->flow[i] = mul(opening, valve_gain(cylinder, &machine->supply, &sample->cylinder[i], p, extending)) -
                           cylinder_leakage(cylinder, &sample->cylinder[i], p);
     }
     estimator_step(&controller->estimator, &machine->estimator, &constants->estimator, &machine->arm, sample);
@@ -101,7 +104,7 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     const enum theta_h om3 = i == SWING ? OM3_SWING : OM3_WRIST;
 
     struct arm_row phi2;
-    arm_inverse_dynamics(&machine->arm, desired, i, w, a, &phi2);
+    arm_inverse_dynamics(&machine->arm, desired, i, w, a, sample->lever[i], &phi2);
     scalar torque_step = SCALAR(0);
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
         const uint8_t parameter = row_parameter[i][k];
@@ -126,7 +129,7 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
         .gain_retracting = valve_gain(&machine->cylinder[i], &machine->supply, c, measured->p[i], false),
     };
     if (!controller->diarc[i].started) {
-        diarc_start(&controller->diarc[i], &machine->diarc[i], &in, constants->dt_s);
+        diarc_start(&controller->diarc[i], &machine->diarc[i], &in);
     }
     const struct diarc_output output =
         diarc_step(&controller->diarc[i], &machine->diarc[i], &in, constants->dt_s);
@@ -172,6 +175,7 @@ void controller_step(struct controller *controller, const struct machine *machin
             out->u = diarc_joint(controller, machine, constants, measured, &sample, (enum joint)i, theta,
                                  &desired, out);
         }
+        out->u = limit(valve_spool(&machine->cylinder[i], out->u), SCALAR(-1), SCALAR(1));
         trajectory_advance(&controller->trajectory[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {

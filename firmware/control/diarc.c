@@ -53,15 +53,15 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
     return s;
 }
 
-void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in,
-                 scalar dt_s)
+void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in)
 {
-    (void)dt_s;
-    *diarc = (struct diarc){.torque_ff = in->torque_ff, .started = true};
-    /* at rest on the reference F_Ld = (torque_ff - gamma1) / R; then e3 = 0 */
-    diarc->gamma1 = symmetric_limit(in->torque_ff - mul(in->cylinder.R, in->force), gains->gamma1_max);
-    const struct two_steps s = two_steps(diarc, gains, in, SCALAR(0));
-    diarc->gamma2 = symmetric_limit(s.Q_Ld, gains->gamma2_max);
+    /* at rest on the reference F_Ld = (torque_ff - gamma1) / R, so this makes e3 = 0 */
+    const scalar measured = mul(in->cylinder.R, in->force);
+    *diarc = (struct diarc){
+        .gamma1 = symmetric_limit(in->torque_ff - measured, gains->gamma1_max),
+        .torque_ff = in->torque_ff,
+        .started = true,
+    };
 }
 
 struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,

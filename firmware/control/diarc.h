@@ -57,9 +57,9 @@ struct diarc_output {
     bool saturated;
 };
 
-/* Bumpless start: gamma1 such that F_Ld is the measured force, gamma2 such that the valve begins shut. */
-void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in,
-                 scalar dt_s);
+/* Bumpless start: gamma1 such that F_Ld is the measured force. gamma2 starts at zero: what the valve then
+ * passes at rest is the leakage. */
+void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in);
 
 struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
                                const struct diarc_input *in, scalar dt_s);

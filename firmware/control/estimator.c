@@ -7,6 +7,9 @@
  * another hold little that is new. */
 #define ROW_TURNS 4
 
+/* This many innovations in a row that are too large mean a changed load, and not one strange sample. */
+#define STRIKES 3
+
 static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
     [SWING] = {BETA_INVERSE, OM2_SWING, OM3_SWING},
     [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
@@ -44,6 +47,7 @@ struct estimator_constants estimator_constants(const struct estimator_parameters
     constants.walk =
         mul(square(quot(parameters->load_walk, constants.scale_m[M_T])), mul(dt_s, SCALAR(ROW_TURNS / 2)));
     constants.load_variance = square(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
+    constants.innovation_limit_squared = square(parameters->innovation_limit);
     return constants;
 }
 
@@ -70,7 +74,8 @@ void estimator_start(struct estimator *estimator, const struct estimator_paramet
     estimator_resume(estimator);
 }
 
-void estimator_resume(struct estimator *estimator)
+/* Empty filters; the balances go on from the samples that are there. */
+static void start_filters(struct estimator *estimator)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
         for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
@@ -81,7 +86,14 @@ void estimator_resume(struct estimator *estimator)
         }
         estimator->open[i] = (struct two_poles){0};
         estimator->previous_gate[i] = SCALAR(0);
+        estimator->strikes[i] = 0;
     }
+    estimator->ramp = SCALAR(0);
+}
+
+void estimator_resume(struct estimator *estimator)
+{
+    start_filters(estimator);
     estimator->samples = 0;
     estimator->since_update = ROW_TURNS;
     estimator->updating = false;
@@ -114,7 +126,7 @@ static void mechanics_balance(struct estimator *e, const struct estimator_consta
             middle_w[n] = mul(SCALAR(0.5), e->previous_w[n] + half_w[n]);
         }
         struct arm_row force;
-        arm_force(arm, &at->trig, i, middle_w, at->reference_w[i], &force);
+        arm_force(arm, &at->trig, i, middle_w, at->reference_w[i], at->lever[i], &force);
         const struct arm_row *const before = &e->previous_momentum[i];
         const scalar g = e->previous_gate[i];
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
@@ -129,14 +141,17 @@ static void mechanics_balance(struct estimator *e, const struct estimator_consta
 }
 
 /* Flow balance of joint i over the sample (k-1, k), gated and filtered: Eq 6 in the form of Eq 25. */
-static void hydraulics_balance(struct estimator *e, const struct estimator_constants *constants, enum joint i,
+static void hydraulics_balance(struct estimator *e, const struct estimator_parameters *parameters,
+                               const struct estimator_constants *constants, enum joint i,
                                scalar half_w, const struct estimator_sample *now)
 {
     const struct estimator_sample *const before = &e->previous;
     const struct cylinder_state *const c0 = &before->cylinder[i];
     const struct cylinder_state *const c1 = &now->cylinder[i];
     const scalar half = SCALAR(0.5);
-    const scalar g = e->previous_gate[i];
+    const scalar noise = parameters->flow_noise[i];
+    const scalar flow_error = mul(parameters->flow_error, absolute(before->flow[i]));
+    const scalar g = mul(e->previous_gate[i], quot(noise, noise + flow_error));
     const scalar force_rate = amp(constants->per_tick, now->force[i] - before->force[i]);
     const scalar displaced = mul(mul(half, mul(c0->lamA, c0->R) + mul(c1->lamA, c1->R)), half_w);
     const scalar flow = mul(half, before->flow[i] + now->flow[i]);
@@ -147,15 +162,37 @@ static void hydraulics_balance(struct estimator *e, const struct estimator_const
     low_pass(&row[3], constants->filter, mul(g, displaced - flow));
 }
 
-/* theta += K residual, then projection onto the bounds, Eq 21: integrate, then clamp. */
-static void update_block(struct ud_factors *covariance, const scalar phi[], scalar residual,
+/* The innovation test of the load: too large several times in a row, and the load alone is open again. */
+static void notice_changed_load(struct estimator *e, const struct estimator_constants *constants,
+                                enum joint i, scalar residual, scalar innovation_variance)
+{
+    const scalar bound = mul(constants->innovation_limit_squared, innovation_variance);
+    if (square(residual) <= bound) {
+        e->strikes[i] = 0;
+        return;
+    }
+    e->strikes[i]++;
+    if (e->strikes[i] < STRIKES) {
+        return;
+    }
+    e->covariance_m.D[M_T] = constants->load_variance;
+    if (e->reopened < UINT16_MAX) {
+        e->reopened++;
+    }
+    start_filters(e);
+}
+
+/* theta += K residual, then projection onto the bounds, Eq 21: integrate, then clamp. Returns the variance that
+ * the residual was expected to have. */
+static scalar update_block(struct ud_factors *covariance, const scalar phi[], scalar residual,
                          const scalar scale[], const struct prior prior[], scalar theta[])
 {
     scalar K[UD_SIZE_MAX];
-    (void)ud_update(covariance, phi, K);
+    const scalar innovation_variance = ud_update(covariance, phi, K);
     for (uint8_t k = 0; k < covariance->size; k++) {
         theta[k] = limit(theta[k] + mul(scale[k], mul(K[k], residual)), prior[k].low, prior[k].high);
     }
+    return innovation_variance;
 }
 
 static void update_mechanics(struct estimator *e, const struct estimator_parameters *parameters,
@@ -172,8 +209,9 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
     if (ud_variance(&e->covariance_m, M_T) < constants->load_variance) {
         e->covariance_m.D[M_T] += constants->walk;
     }
-    update_block(&e->covariance_m, phi, mul(residual, constants->residual_m[i]), constants->scale_m,
-                 parameters->m, e->theta_m);
+    const scalar whitened = mul(residual, constants->residual_m[i]);
+    const scalar variance = update_block(&e->covariance_m, phi, whitened, constants->scale_m, parameters->m, e->theta_m);
+    notice_changed_load(e, constants, i, whitened, variance);
 }
 
 static void update_hydraulics(struct estimator *e, const struct estimator_parameters *parameters,
@@ -187,7 +225,7 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
         residual -= mul(column, e->theta_h[parameter]);
         phi[parameter] = mul(column, constants->phi_h[i][parameter]);
     }
-    update_block(&e->covariance_h, phi, mul(residual, constants->residual_h[i]), constants->scale_h,
+    (void)update_block(&e->covariance_h, phi, mul(residual, constants->residual_h[i]), constants->scale_h,
                  parameters->h, e->theta_h);
 }
 
@@ -217,7 +255,7 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
         for (uint8_t i = 0; i < JOINTS; i++) {
             low_pass(&e->open[i], constants->filter, e->previous_gate[i]);
             mechanics_balance(e, constants, arm, (enum joint)i, &half_trig, half_w);
-            hydraulics_balance(e, constants, (enum joint)i, half_w[i], sample);
+            hydraulics_balance(e, parameters, constants, (enum joint)i, half_w[i], sample);
         }
     }
     if (e->samples < 2u) {
@@ -225,8 +263,9 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
     }
     for (uint8_t i = 0; i < JOINTS; i++) {
         e->previous_w[i] = half_w[i];
-        e->previous_gate[i] = gate(parameters, sample->reference_w[i]);
+        e->previous_gate[i] = mul(e->ramp, gate(parameters, sample->reference_w[i]));
     }
+    e->ramp = smaller(e->ramp + constants->filter, SCALAR(1));
     e->previous = *sample;
 
     const enum joint i = (enum joint)(e->turn % JOINTS);

@@ -11,7 +11,12 @@
  *
  * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over one sample against the flow's mean,
  *     1/be (F_k - F_(k-1)) / dt = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
- * with QL from the measured spool; no pressure is differentiated but inside the filter.
+ * with QL from the measured spool; no pressure is differentiated but inside the filter. Compressibility is
+ * about a hundredth of the flow, as much as a valve gain may be wrong by: so a row weighs less the more flows.
+ *
+ * Changed load. When the mechanics' innovations are too large for their variance several times in a row, the
+ * load's variance is set back to its prior, the load's alone, and the filters start anew so that they hold
+ * nothing of the old load.
  *
  * Least squares runs on UD factors, one row a tick in turn; then projection onto the bounds. The law gets the
  * estimate through a rate limit: sat_M(Proj(..)). Only the load walks: its variance grows while the gate is
@@ -40,8 +45,10 @@ struct estimator_parameters {
     scalar gate_rate;            /* the gate opens from this reference rate on, full at twice it; rad/s */
     scalar torque_noise[JOINTS]; /* sd of a filtered row of the mechanics, N m */
     scalar flow_noise[JOINTS];   /* sd of a filtered row of the hydraulics, m^2/s */
+    scalar flow_error; /* share of the flow that the valve gain may be wrong by */
     scalar load_walk;            /* the load's sd grows by this in 1 s of open gate, kg */
     gain rate_limit;             /* of the estimate the law sees, ranges per second */
+    scalar innovation_limit; /* standard deviations from which an innovation counts as too large */
 };
 
 struct estimator_constants {
@@ -57,6 +64,7 @@ struct estimator_constants {
     scalar step_h[THETA_H];
     scalar walk;          /* variance the load gains per update, in its scale */
     scalar load_variance; /* its bound, in its scale */
+    scalar innovation_limit_squared;
 };
 
 /* What one tick measured and the reference it was measured at. */
@@ -65,6 +73,7 @@ struct estimator_sample {
     scalar reference_w[JOINTS]; /* qd', rad/s */
     struct wrist_trig trig;     /* at the measured q2 */
     struct cylinder_state cylinder[JOINTS];
+    scalar lever[JOINTS];       /* of friction: R over that at q = 0, or 1 */
     scalar force[JOINTS]; /* F */
     scalar flow[JOINTS];  /* QL from the spool, less leakage */
 };
@@ -89,6 +98,9 @@ struct estimator {
     scalar previous_w[JOINTS]; /* rate of the last half step */
     struct arm_row previous_momentum[JOINTS];
     scalar previous_gate[JOINTS];
+    scalar ramp;                    /* 0..1, brings the gate up smoothly after a start of the filters */
+    uint8_t strikes[JOINTS];        /* innovations in a row that were too large */
+    uint16_t reopened;              /* how often a changed load was noticed; stops at 65535 */
     uint8_t turn;    /* which row is updated next, 0..3 */
     uint8_t samples; /* since the restart, up to 2: balances need two */
     bool updating;   /* an update was made within the last four ticks */

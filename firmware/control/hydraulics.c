@@ -18,6 +18,8 @@ struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
     const scalar shortest = cylinder_length(&constants, cosine(cylinder->q_min + cylinder->q0));
     const scalar longest = cylinder_length(&constants, cosine(cylinder->q_max + cylinder->q0));
     constants.X_min = shortest - cylinder->end_margin;
+    constants.lever_inverse =
+        quot(cylinder_length(&constants, cosine(cylinder->q0)), mul(constants.ab, sine(cylinder->q0)));
     constants.x_max = longest - shortest + SCALAR(2) * cylinder->end_margin;
     return constants;
 }
@@ -51,6 +53,20 @@ scalar valve_gain(const struct cylinder *cylinder, const struct supply *supply,
     const scalar per_root = mul(state->lamB, root(larger(drop1, supply->dp_min))) +
                             mul(state->lamC, root(larger(drop2, supply->dp_min)));
     return mul(cylinder->kv, per_root);
+}
+
+/* Opening over which the inverse of the overlap is smoothed. */
+#define OVERLAP_BLEND SCALAR(0.005)
+
+scalar valve_opening(const struct cylinder *cylinder, scalar spool)
+{
+    return spool - limit(spool, -cylinder->overlap, cylinder->overlap);
+}
+
+scalar valve_spool(const struct cylinder *cylinder, scalar opening)
+{
+    const scalar side = limit(quot(opening, OVERLAP_BLEND), SCALAR(-1), SCALAR(1));
+    return opening + mul(cylinder->overlap, side);
 }
 
 scalar cylinder_leakage(const struct cylinder *cylinder, const struct cylinder_state *state,

@@ -22,6 +22,7 @@ struct cylinder {
     scalar q_min, q_max; /* joint range, rad */
     scalar end_margin;   /* stroke to spare at each end, m on the lever base */
     scalar kv;           /* Q = kv u sqrt(dp), m^3/s/sqrt(Pa), u in -1..1 */
+    scalar overlap;           /* spool travel either side of the middle that passes nothing */
     scalar leakage;      /* c_l, m^3/s/Pa */
 };
 
@@ -37,6 +38,7 @@ struct cylinder_constants {
     scalar ab;
     scalar X_min; /* length when retracted */
     scalar x_max; /* stroke */
+    scalar lever_inverse;      /* 1 / R at q = 0 */
 };
 
 /* The cylinder at one joint angle. */
@@ -57,6 +59,11 @@ scalar cylinder_force(const struct cylinder_constants *constants, const scalar p
 /* QL per unit spool, Eq 7 with one root per port and per sign of u: the factor of u in Eq 6. Always > 0. */
 scalar valve_gain(const struct cylinder *cylinder, const struct supply *supply,
                   const struct cylinder_state *state, const scalar p[CHAMBERS], bool extending);
+
+/* What of the spool's position passes oil, and its inverse, Eq 7: the position for a wanted opening. The inverse
+ * is smoothed over an opening of 0.5 %, where the spool would otherwise jump with every change of sign. */
+scalar valve_opening(const struct cylinder *cylinder, scalar spool);
+scalar valve_spool(const struct cylinder *cylinder, scalar opening);
 
 /* (lamB + lamC) c_l (p1 - p2): what leakage takes from QL. */
 scalar cylinder_leakage(const struct cylinder *cylinder, const struct cylinder_state *state,

@@ -10,6 +10,9 @@
 #define SENSORS_WRONG_LIMIT 5u /* ticks in a row; one more is a fault in RUN */
 #define SLOW_CYCLE_TICKS 10u   /* one slow frame in each of these phases, never two in a tick */
 #define HEARTBEAT_US 100000u
+#define TARE_US 100000u
+#define TARE_LIMIT_RAW 1000 /* 5 bar from tank pressure: more is no sensor's error, the pump is on */
+#define TARE_EXTRA_BITS 4   /* the mean is kept finer than a raw step */
 #define US_PER_S 1000000u
 #define US_PER_MS 1000u
 #define NODE_ALL 0u
@@ -123,7 +126,7 @@ static void nmt_command(struct ecu *ecu, const struct can_frame_11bit *frame)
     case DIARC_NMT_COMMAND_STOP_CHOICE:
     case DIARC_NMT_COMMAND_ENTER_PREOPERATIONAL_CHOICE:
         ecu->nmt = frame->data[0] == DIARC_NMT_COMMAND_STOP_CHOICE ? NMT_STOPPED : NMT_PRE_OPERATIONAL;
-        if (ecu->mode == MODE_RUN) {
+        if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
             leave_run(ecu, MODE_STANDBY);
         }
         break;
@@ -171,6 +174,18 @@ static enum ecu_refusal request_move(struct ecu *ecu, const struct diarc_motion_
                                                                             : REFUSAL_DURATION_TOO_SHORT;
 }
 
+static enum ecu_refusal request_tare(struct ecu *ecu)
+{
+    if (ecu->mode != MODE_STANDBY) {
+        return REFUSAL_NOT_IN_STANDBY;
+    }
+    ecu->tare = (struct tare){0};
+    ecu->tare.samples = (uint16_t)(TARE_US / ecu->period_us);
+    ecu->tare.samples_left = ecu->tare.samples;
+    ecu->mode = MODE_TARE;
+    return REFUSAL_NONE;
+}
+
 static enum ecu_refusal request_fault_reset(struct ecu *ecu)
 {
     if (ecu->mode != MODE_FAULT) {
@@ -197,8 +212,10 @@ static void motion_request(struct ecu *ecu)
         refusal = request_move(ecu, &motion);
     } else if (motion.request == DIARC_MOTION_REQUEST_RESET_FAULT_CHOICE) {
         refusal = request_fault_reset(ecu);
+    } else if (motion.request == DIARC_MOTION_REQUEST_TARE_CHOICE) {
+        refusal = request_tare(ecu);
     } else if (motion.request == DIARC_MOTION_REQUEST_STANDBY_CHOICE) {
-        if (ecu->mode == MODE_RUN) {
+        if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
             leave_run(ecu, MODE_STANDBY);
         }
     } else if (motion.request != DIARC_MOTION_REQUEST_NONE_CHOICE) {
@@ -308,8 +325,10 @@ static struct measurement measurement(const struct ecu *ecu, const struct sensor
         m.q[i] = WIRE_DECODE(now->angle[i], DIARC_ENCODERS_SWING_ANGLE, 0);
         /* the difference of the integers: exact, whatever the number type */
         m.dq[i] = WIRE_DECODE(now->angle[i] - before->angle[i], DIARC_ENCODERS_SWING_ANGLE, 0);
-        m.p[i][BORE] = WIRE_DECODE(now->pressure[i][BORE], DIARC_PRESSURES_SWING_BORE_PRESSURE, p);
-        m.p[i][ANNULUS] = WIRE_DECODE(now->pressure[i][ANNULUS], DIARC_PRESSURES_SWING_ANNULUS_PRESSURE, p);
+        m.p[i][BORE] = WIRE_DECODE(now->pressure[i][BORE], DIARC_PRESSURES_SWING_BORE_PRESSURE, p) -
+                       ecu->tare.offset[i][BORE];
+        m.p[i][ANNULUS] = WIRE_DECODE(now->pressure[i][ANNULUS], DIARC_PRESSURES_SWING_ANNULUS_PRESSURE, p) -
+                          ecu->tare.offset[i][ANNULUS];
         m.spool[i] = WIRE_DECODE(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
     }
     return m;
@@ -331,6 +350,7 @@ static void supervise(struct ecu *ecu, const struct ecu_port *port, bool good, b
         }
         break;
     case MODE_STANDBY:
+    case MODE_TARE:
         if (gone) {
             ecu->mode = MODE_INIT;
         }
@@ -343,6 +363,38 @@ static void supervise(struct ecu *ecu, const struct ecu_port *port, bool good, b
     case MODE_FAULT:
     default:
         break;
+    }
+}
+
+/* One sample of the tare; with the last one its offsets, or a refusal when the chambers are not at tank pressure. */
+static void tare_step(struct ecu *ecu, bool good)
+{
+    struct tare *const tare = &ecu->tare;
+    if (ecu->mode != MODE_TARE || !good) {
+        return;
+    }
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        tare->sum[i][BORE] += ecu->samples.pressure[i][BORE];
+        tare->sum[i][ANNULUS] += ecu->samples.pressure[i][ANNULUS];
+    }
+    tare->samples_left--;
+    if (tare->samples_left > 0u) {
+        return;
+    }
+    ecu->mode = MODE_STANDBY;
+    const int8_t base = ecu->bases.pressure;
+    const scalar tank = ecu->machine.supply.p_tank;
+    const scalar limit_Pa = WIRE_DECODE(TARE_LIMIT_RAW, DIARC_PRESSURES_SWING_BORE_PRESSURE, base);
+    for (uint8_t n = 0; n < JOINTS * CHAMBERS; n++) {
+        const int32_t sum = tare->sum[n / CHAMBERS][n % CHAMBERS];
+        const int32_t mean = sum * (1 << TARE_EXTRA_BITS) / tare->samples;
+        const scalar p = WIRE_DECODE(mean, DIARC_PRESSURES_SWING_BORE_PRESSURE, (int8_t)(base + TARE_EXTRA_BITS));
+        tare->offset[n / CHAMBERS][n % CHAMBERS] = p - tank;
+        if (absolute(p - tank) > limit_Pa) {
+            *tare = (struct tare){0};
+            refuse(ecu, REFUSAL_NOT_DEPRESSURISED);
+            return;
+        }
     }
 }
 
@@ -398,6 +450,7 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
         }
         ecu->sampled = true;
         supervise(ecu, port, good, invalid);
+        tare_step(ecu, good);
         arm_if_requested(ecu, good, &measured);
         controller_step(&ecu->controller, &ecu->machine, &ecu->constants, &measured);
     }

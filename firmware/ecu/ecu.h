@@ -22,6 +22,7 @@ enum ecu_mode {
     MODE_INIT = 0,    /* waits for all sensors, or for NMT start */
     MODE_STANDBY = 1, /* sensors good, valves shut */
     MODE_RUN = 2,     /* the law drives the valves */
+    MODE_TARE = 3,    /* averages the pressure sensors with the pump off, then STANDBY */
     MODE_FAULT = 15   /* until RESET_FAULT */
 };
 
@@ -40,7 +41,8 @@ enum ecu_refusal {
     REFUSAL_TARGET_OUT_OF_RANGE,
     REFUSAL_DURATION_TOO_SHORT,
     REFUSAL_NO_FAULT_TO_RESET,
-    REFUSAL_UNKNOWN_REQUEST
+    REFUSAL_UNKNOWN_REQUEST,
+    REFUSAL_NOT_DEPRESSURISED
 };
 
 /* Raw samples of the last tick they were good in. */
@@ -48,6 +50,14 @@ struct sensor_samples {
     int32_t angle[JOINTS];
     int32_t pressure[JOINTS][CHAMBERS];
     int32_t spool[JOINTS];
+};
+
+/* Zero of the pressure sensors, found with all chambers at tank pressure. */
+struct tare {
+    uint16_t samples_left;
+    uint16_t samples;
+    int32_t sum[JOINTS][CHAMBERS];    /* raw */
+    scalar offset[JOINTS][CHAMBERS];  /* Pa */
 };
 
 struct ecu_counters {
@@ -73,6 +83,7 @@ struct ecu {
     enum ecu_fault fault;
     struct receive receive;
     struct sensor_samples samples;
+    struct tare tare;
     bool sampled;           /* samples hold a complete set */
     uint8_t sensors_wrong;  /* ticks in a row that sensors were missing or wrong; stops at 255 */
     bool restart_requested; /* by NMT */
