@@ -43,6 +43,7 @@ EFFECTS: dict[str, tuple[float, float, float]] = {  # default, low, high
     "effects.encoder_bits": (0.0, 0.0, 24.0),
     "effects.pressure_gain_error": (0.0, 0.0, 0.1),
     "effects.pressure_offset_Pa": (0.0, 0.0, 1e6),
+    "effects.sensor_set": (1.0, 0.0, 1e6),
     "effects.sync_jitter_s": (0.0, 0.0, 5e-4),
     "effects.frame_loss": (0.0, 0.0, 0.2),
     "effects.viscosity_factor": (1.0, 0.1, 10.0),

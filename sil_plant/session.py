@@ -293,7 +293,7 @@ def sensor_noise(machine: Machine, seed: int, ticks: int) -> np.ndarray:
     Columns: two angles (rad), four pressures (Pa), sampling and delay jitter (-1..1), and for three sensor frames
     and the valve frame a number in 0..1 that decides whether it is lost.
     """
-    angles, pressures, _, frames = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4))
+    angles, pressures, frames = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3))
     amplitude = machine["sensors.encoder_noise_rad"]
     chance = frames.uniform(0.0, 1.0, (ticks, 6))
     chance[:, :2] = 2.0 * chance[:, :2] - 1.0
@@ -346,7 +346,7 @@ def make_session(
         plant=plant,
         layout=node_layout(),
         timing=node_timing(plant_machine, period_s),
-        errors=node_errors(plant_machine, seed),
+        errors=node_errors(plant_machine),
         timeline=timeline,
         monitor_layout=monitor_layout(),
         monitor=Monitor(
