@@ -11,12 +11,9 @@ from __future__ import annotations
 
 import argparse
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -32,8 +29,9 @@ enter(__file__)
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
 
-from sil_plant import bus_run, inproc, protocol, results, session  # noqa: E402
-from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port, parse_bus  # noqa: E402
+from sil_plant import bus_run, execution, inproc, protocol, results, session  # noqa: E402
+from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
+from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
 from sil_plant.scenario import (  # noqa: E402
@@ -47,47 +45,7 @@ from sil_plant.scenario import (  # noqa: E402
     with_load,
 )
 
-ECU_BINARY = ROOT / "firmware" / "diarc_ecu"
-PERIOD_US = 1000
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
-SPAWN_STOP_S = 5.0
-INPROC_CHUNK = 250
-
-
-class SpawnedEcu:
-    """An ECU process of ours.
-
-    Parameters
-    ----------
-    bus : str
-        The bus string it gets.
-    pace : str
-        Its ``--pace``.
-    params : Path
-        Its parameter image.
-    """
-
-    def __init__(self, bus: str, pace: str, params: Path) -> None:
-        if not ECU_BINARY.exists():
-            raise ConfigError(f"{ECU_BINARY.relative_to(ROOT)} is not built; build it: make firmware")
-        command = [str(ECU_BINARY), bus, "--pace", pace, "--quiet", "--params", str(params)]
-        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-
-    def check(self) -> None:
-        """Raise when the process has ended."""
-        status = self.process.poll()
-        if status is not None:
-            raise bus_run.EcuLostError(f"the ECU that was started has ended with status {status}")
-
-    def stop(self) -> None:
-        """End the process as its user would, and at last by force."""
-        if self.process.poll() is None:
-            self.process.terminate()
-        try:
-            self.process.wait(SPAWN_STOP_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
 
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
@@ -112,6 +70,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         "--seed", type=int, metavar="N", help="of the sensor noise; default: the scenario's, 1"
     )
     parser.add_argument("--controller", choices=session.CONTROLLERS, default="diarc")
+    parser.add_argument("--params", type=Path, metavar="FILE", help="commissioned set from tools/commission.py")
     parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")
     parser.add_argument(
         "--profile", choices=PROFILE_NAMES, default="paper", help="how kind the plant is; default paper"
@@ -151,7 +110,10 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     if arguments.arm != REFERENCE_ARM and address.kind != "inproc" and arguments.ecu != "spawn":
         say("run.py: note: the ECU on the bus must have been started with this machine's --params")
     profile = load_profile(arguments.profile)
-    machine = with_changes(load_machine(arguments.arm), profile.machine, f"profile {profile.name}: [machine]")
+    machine = load_machine(arguments.arm)
+    if arguments.params:
+        machine = load_commissioned(arguments.params, machine)
+    machine = with_changes(machine, profile.machine, f"profile {profile.name}: [machine]")
     scenario = load_scenario(arguments.scenario)
     if arguments.load is not None:
         if not arguments.load >= 0.0:
@@ -174,63 +136,6 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     return Inputs(machine, plant_machine, scenario, profile.tare, address)
 
 
-def compile_plant(machine: Machine, scenario: Scenario) -> None:
-    """Run a few ticks in memory, so that no compiling happens while a bus waits."""
-    from numba.core import config
-
-    if not any(Path(config.CACHE_DIR).glob("**/session.on_sync*.nbi")):
-        say("run.py: compiling the plant, once after installation (about 20 s) ...")
-    short = replace(scenario, duration_s=0.01)
-    try:
-        warm = session.make_session(machine, with_load(short, 0.0), "diarc", 0, PERIOD_US * 1e-6)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-    inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
-    bus_run.warm_up(warm)
-
-
-def ignore_progress(tick: int) -> None:
-    """For runs that show none."""
-
-
-def run_in_process(run: session.Session, image: bytes, scalar: str, progress: Callable[[int], None]) -> None:
-    """Run the session with the firmware in this process."""
-    ecu = inproc.InprocEcu(image, PERIOD_US, scalar)
-    while inproc.run_inproc(run, ecu, INPROC_CHUNK) == INPROC_CHUNK:
-        progress(int(run.progress.index[session.TICK]))
-        bus_run.check_hash(run)
-
-
-def run_over_bus(
-    run: session.Session,
-    address: BusAddress,
-    arguments: argparse.Namespace,
-    image: bytes,
-    progress: Callable[[int], None],
-    started: Callable[[], None],
-) -> None:
-    """Run the session with an ECU on a bus, one of ours or one that is there."""
-    with ExitStack() as stack:
-        port = stack.enter_context(open_frame_port(address, host_hub=True))
-        bus = arguments.bus
-        if isinstance(port, HubPort):
-            bus = f"tcp:{address.host}:{port.hub.port}"
-            if not arguments.quiet and arguments.ecu == "external":
-                say(f"run.py: CAN over TCP at {bus}; start the ECU: ./firmware/diarc_ecu {bus}")
-        alive: Callable[[], None] = lambda: None  # noqa: E731
-        if arguments.ecu == "spawn":
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="diarc-"))
-            params = Path(folder) / "machine.params"
-            params.write_bytes(image)
-            ecu = SpawnedEcu(bus, arguments.pace or "realtime", params)
-            stack.callback(ecu.stop)
-            alive = ecu.check
-        stack.callback(bus_run.leave_ecu_safe, port)
-        bus_run.wait_for_ecu(port, bus, alive)
-        started()
-        bus_run.run_on_bus(run, port, progress, alive)
-
-
 def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run) -> results.Result:
     """Write what was recorded and print the table."""
     result = results.summarise(record, run)
@@ -243,33 +148,18 @@ def write_outputs(arguments: argparse.Namespace, record: session.Record, run: re
     return result
 
 
-def outcome(run: session.Session) -> str | None:
-    """What went wrong in a run that reached its end, or None."""
-    whole = run.monitor.whole
-    if whole[session.FAULTED]:
-        return (
-            f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
-        )
-    if whole[session.MODE] != session.MODE_RUN:
-        mode = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
-        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]})"
-    if whole[session.REFUSED]:
-        return (
-            f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
-        )
-    return None
-
-
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        machine, plant_machine, scenario, tare, address = load_inputs(arguments)
-        compile_plant(machine, scenario)
+        inputs = load_inputs(arguments)
+        machine, scenario = inputs.machine, inputs.scenario
+        execution.compile_plant(machine, scenario)
+        period_s = execution.PERIOD_US * 1e-6
         try:
             run = session.make_session(
-                plant_machine, scenario, arguments.controller, scenario.seed, PERIOD_US * 1e-6, tare
+                inputs.plant_machine, scenario, arguments.controller, scenario.seed, period_s, inputs.tare
             )
         except ValueError as error:
             raise ConfigError(f"{error} with the supply of {machine.name}") from error
@@ -281,7 +171,7 @@ def main(argv: list[str]) -> int:
         return EXIT_INTERRUPTED
 
     status, problem = 0, None
-    clock = [time.perf_counter()]
+    start, wall_s = time.perf_counter(), None
     console = Console(stderr=True)
     show = console.is_terminal and not arguments.quiet
     bar = Progress(
@@ -291,20 +181,14 @@ def main(argv: list[str]) -> int:
     with bar:
         task = bar.add_task("arm moving", total=len(run.noise))
         progress: Callable[[int], None] = (
-            (lambda tick: bar.update(task, completed=tick)) if show else ignore_progress
+            (lambda tick: bar.update(task, completed=tick)) if show else (lambda _: None)
         )
         try:
-            if address.kind == "inproc":
-                run_in_process(run, image, arguments.scalar, progress)
+            if inputs.address.kind == "inproc":
+                wall_s = execution.in_process(run, image, arguments.scalar, progress)
             else:
-                run_over_bus(
-                    run,
-                    address,
-                    arguments,
-                    image,
-                    progress,
-                    lambda: clock.__setitem__(0, time.perf_counter()),
-                )
+                pace = (arguments.pace or "realtime") if arguments.ecu == "spawn" else None
+                wall_s = execution.over_bus(run, inputs.address, pace, image, progress, arguments.quiet)
         except (ConfigError, BusError, bus_run.EcuMissingError) as error:
             status, problem = EXIT_WRONG_USE, str(error)
         except bus_run.EcuLostError as error:
@@ -315,11 +199,10 @@ def main(argv: list[str]) -> int:
                 EXIT_INTERRUPTED,
                 "interrupted; the valves are closed, what was recorded is kept",
             )
-    wall_s = time.perf_counter() - clock[0]
 
     ticks = int(run.progress.index[session.TICK])
     if status == 0:
-        problem = outcome(run)
+        problem = execution.outcome(run)
         status = EXIT_FAILED if problem else 0
     if ticks:
         figures = results.Run(
@@ -331,7 +214,7 @@ def main(argv: list[str]) -> int:
             timeline=run.timeline,
             ticks=ticks,
             lost_frames=int(run.monitor.whole[session.LOST] + session.sync_lost(run)),
-            wall_s=wall_s,
+            wall_s=time.perf_counter() - start if wall_s is None else wall_s,
             load_est_kg=float(run.monitor.load[0]),
         )
         try:

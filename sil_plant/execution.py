@@ -1,0 +1,159 @@
+"""Carry out a session: with the firmware in this process, or with an ECU on a bus, ours or one that is there."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from sil_plant import bus_run, inproc, session
+from sil_plant.buses import BusAddress, HubPort, open_frame_port
+from sil_plant.config import ROOT, ConfigError
+from sil_plant.environment import say
+from sil_plant.machine import Machine
+from sil_plant.scenario import Scenario, with_load
+
+ECU_BINARY = ROOT / "firmware" / "diarc_ecu"
+PERIOD_US = 1000
+SPAWN_STOP_S = 5.0
+INPROC_CHUNK = 250
+
+
+class SpawnedEcu:
+    """An ECU process of ours.
+
+    Parameters
+    ----------
+    bus : str
+        The bus string it gets.
+    pace : str
+        Its ``--pace``.
+    params : Path
+        Its parameter image.
+    """
+
+    def __init__(self, bus: str, pace: str, params: Path) -> None:
+        if not ECU_BINARY.exists():
+            raise ConfigError(f"{ECU_BINARY.relative_to(ROOT)} is not built; build it: make firmware")
+        command = [str(ECU_BINARY), bus, "--pace", pace, "--quiet", "--params", str(params)]
+        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+
+    def check(self) -> None:
+        """Raise when the process has ended."""
+        status = self.process.poll()
+        if status is not None:
+            raise bus_run.EcuLostError(f"the ECU that was started has ended with status {status}")
+
+    def stop(self) -> None:
+        """End the process as its user would, and at last by force."""
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(SPAWN_STOP_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def compile_plant(machine: Machine, scenario: Scenario) -> None:
+    """Run a few ticks in memory, so that no compiling happens while a bus waits.
+
+    Raises
+    ------
+    ConfigError
+        When the firmware is not built or refuses the machine.
+    """
+    from numba.core import config
+
+    if not any(Path(config.CACHE_DIR).glob("**/session.on_sync*.nbi")):
+        say("compiling the plant, once after installation (about 20 s) ...")
+    short = with_load(replace(scenario, duration_s=0.01), 0.0)
+    try:
+        warm = session.make_session(machine, short, "diarc", 0, PERIOD_US * 1e-6)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
+    bus_run.warm_up(warm)
+
+
+def in_process(run: session.Session, image: bytes, scalar: str, progress: Callable[[int], None]) -> float:
+    """Run the session with the firmware in this process; the wall time it took, s."""
+    ecu = inproc.InprocEcu(image, PERIOD_US, scalar)
+    start = time.perf_counter()
+    while inproc.run_inproc(run, ecu, INPROC_CHUNK) == INPROC_CHUNK:
+        progress(int(run.progress.index[session.TICK]))
+        bus_run.check_hash(run)
+    return time.perf_counter() - start
+
+
+def over_bus(
+    run: session.Session,
+    address: BusAddress,
+    pace: str | None,
+    image: bytes,
+    progress: Callable[[int], None],
+    quiet: bool,
+) -> float:
+    """Run the session with an ECU on a bus.
+
+    Parameters
+    ----------
+    run : Session
+        The run.
+    address : BusAddress
+        The bus; a ``tcp:`` one is hosted here.
+    pace : str or None
+        Start an ECU of ours at this pace; None uses the one that is there.
+    image : bytes
+        Parameter image of an ECU of ours.
+    progress : callable
+        Told the tick now and then.
+    quiet : bool
+        Say nothing but errors.
+
+    Returns
+    -------
+    float
+        Wall time from the ECU's restart to the end of the run, s.
+    """
+    with ExitStack() as stack:
+        port = stack.enter_context(open_frame_port(address, host_hub=True))
+        bus = str(address)
+        if isinstance(port, HubPort):
+            bus = f"tcp:{address.host}:{port.hub.port}"
+            if not quiet and pace is None:
+                say(f"CAN over TCP at {bus}; start the ECU: ./firmware/diarc_ecu {bus}")
+        alive: Callable[[], None] = _always
+        if pace is not None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="diarc-"))
+            params = Path(folder) / "machine.params"
+            params.write_bytes(image)
+            ecu = SpawnedEcu(bus, pace, params)
+            stack.callback(ecu.stop)
+            alive = ecu.check
+        stack.callback(bus_run.leave_ecu_safe, port)
+        bus_run.wait_for_ecu(port, bus, alive)
+        start = time.perf_counter()
+        bus_run.run_on_bus(run, port, progress, alive)
+        return time.perf_counter() - start
+
+
+def _always() -> None:
+    """An ECU that is not ours is watched through its frames alone."""
+
+
+def outcome(run: session.Session) -> str | None:
+    """What went wrong in a run that reached its end, or None."""
+    whole = run.monitor.whole
+    if whole[session.FAULTED]:
+        return f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
+    if whole[session.MODE] != session.MODE_RUN:
+        mode = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
+        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]})"
+    if whole[session.REFUSED]:
+        return f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
+    return None
