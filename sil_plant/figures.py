@@ -148,9 +148,7 @@ def draw_angles(axes: Axes, trace: Trace) -> None:
     """Both joints' angles over their references; the second is dashed, as it may lie on the first."""
     for joint in range(len(JOINT_NAMES)):
         label = "reference" if joint == 0 else None
-        axes.plot(
-            trace.time_s, trace.reference_rad[:, joint], color=REFERENCE_COLOUR, linewidth=6.0, label=label
-        )
+        axes.plot(trace.time_s, trace.reference_rad[:, joint], color=REFERENCE_COLOUR, linewidth=6.0, label=label)
     for joint, name in enumerate(JOINT_NAMES):
         axes.plot(
             trace.time_s,
@@ -197,9 +195,7 @@ def draw_spools(axes: Axes, trace: Trace) -> None:
     _finish(axes, "Spool commands", "set-point, % of stroke")
 
 
-def run_figure(
-    record: Record, period_s: float, title: str, motion_tick: int = 0, ticks: int | None = None
-) -> Figure:
+def run_figure(record: Record, period_s: float, title: str, motion_tick: int = 0, ticks: int | None = None) -> Figure:
     """One run: angles, tracking errors, load estimate and spool commands; parameters as `trace_of`."""
     return trace_figure(trace_of(record, period_s, motion_tick, ticks), title)
 
