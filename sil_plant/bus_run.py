@@ -72,9 +72,7 @@ def wait_for_ecu(port: FramePort, bus: str, alive: Callable[[], None]) -> None:
         )
 
 
-def _heard(
-    port: FramePort, limit_s: float, wanted: Callable[[int, bytes], bool], alive: Callable[[], None]
-) -> bool:
+def _heard(port: FramePort, limit_s: float, wanted: Callable[[int, bytes], bool], alive: Callable[[], None]) -> bool:
     deadline = time.monotonic() + limit_s
     while (left := deadline - time.monotonic()) > 0.0:
         frame = port.receive(min(left, 0.1))
@@ -84,9 +82,7 @@ def _heard(
     return False
 
 
-def run_on_bus(
-    session: Session, port: FramePort, progress: Callable[[int], None], alive: Callable[[], None]
-) -> None:
+def run_on_bus(session: Session, port: FramePort, progress: Callable[[int], None], alive: Callable[[], None]) -> None:
     """Run the session to its end; the ECU must just have booted.
 
     Parameters

@@ -119,9 +119,7 @@ def parse_bus(text: str) -> BusAddress:
         return BusAddress("tcp", host=host, port=int(port_text), channel="vcan0")
     if kind == "slcan":
         if not rest or " " in rest:
-            raise BusError(
-                f"bus {text!r}: name the device: slcan:/dev/ttyACM0 or slcan:socket://127.0.0.1:3333"
-            )
+            raise BusError(f"bus {text!r}: name the device: slcan:/dev/ttyACM0 or slcan:socket://127.0.0.1:3333")
         return BusAddress("slcan", channel=rest)
     if not colon and re.fullmatch(r"[A-Za-z][A-Za-z0-9_.-]{0,14}", text):  # an interface name for Linux
         return BusAddress("socketcan", channel=text)
@@ -193,9 +191,7 @@ class FramePort(ABC):
         self.close()
 
 
-def open_frame_port(
-    address: BusAddress | str, host_hub: bool = False, *, allow_remote: bool = False
-) -> FramePort:
+def open_frame_port(address: BusAddress | str, host_hub: bool = False, *, allow_remote: bool = False) -> FramePort:
     """Open a bus for the plant.
 
     Parameters

@@ -172,7 +172,11 @@ def to_toml(machine: Machine, found: list[Finding], profile: str) -> str:
         "[parameters]",
     ]
     lines += [f'"estimator.prior.{f.prior}.value" = {f.value!r}' for f in found]
-    lines += ["", "# How well it is known: standard deviation, and prior over posterior standard deviation.", "[quality]"]
+    lines += [
+        "",
+        "# How well it is known: standard deviation, and prior over posterior standard deviation.",
+        "[quality]",
+    ]
     lines += [f'"{f.prior}" = {{ sd = {f.sd!r}, excitation = {round(f.excitation, 1)!r} }}' for f in found]
     return "\n".join(lines) + "\n"
 

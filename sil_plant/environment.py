@@ -36,3 +36,11 @@ def enter(script: str) -> None:
 def say(text: str) -> None:
     """Write one line to standard error."""
     print(text, file=sys.stderr, flush=True)
+
+
+def show(text: str) -> None:
+    """Write text to standard output; a reader that has gone away is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

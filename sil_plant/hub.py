@@ -282,8 +282,7 @@ class Hub:
     def clients(self) -> list[ClientInfo]:
         """The clients connected now."""
         return [
-            ClientInfo(c.address, c.channel, c.mode, c.frames, c.malformed, c.waiting)
-            for c in self._clients.values()
+            ClientInfo(c.address, c.channel, c.mode, c.frames, c.malformed, c.waiting) for c in self._clients.values()
         ]
 
     def close(self, linger_s: float = 0.5) -> None:
@@ -440,9 +439,7 @@ class Hub:
         """Stop or resume reading from all clients, because the owner lags behind."""
         self._paused = paused
         if paused:
-            self._note(
-                f"{len(self._inbox)} frames wait for the owner: the clients have to wait, too", warn=True
-            )
+            self._note(f"{len(self._inbox)} frames wait for the owner: the clients have to wait, too", warn=True)
         for client in self._clients.values():
             self._watch(client)
 
@@ -593,9 +590,7 @@ def _listen(host: str, port: int, allow_remote: bool) -> socket.socket:
     try:
         address = socket.getaddrinfo(host or "0.0.0.0", port, socket.AF_INET, socket.SOCK_STREAM)[0][4]
     except (OSError, OverflowError) as error:
-        raise BusError(
-            f"cannot listen on {where}: {error}; try --bus tcp:127.0.0.1:{DEFAULT_PORT}"
-        ) from error
+        raise BusError(f"cannot listen on {where}: {error}; try --bus tcp:127.0.0.1:{DEFAULT_PORT}") from error
     if not allow_remote and not ipaddress.ip_address(address[0]).is_loopback:
         raise BusError(
             f"refused to listen on {where}: other computers could move the arm (CAN has no authentication); "
@@ -614,9 +609,7 @@ def _listen(host: str, port: int, allow_remote: bool) -> socket.socket:
                 f"port {port} on {host} is taken: choose another (--bus tcp:{host}:{port % 65535 + 1}) "
                 f"or find who holds it: ss -ltnp 'sport = :{port}'"
             ) from error
-        raise BusError(
-            f"cannot listen on {where}: {error.strerror}; use --bus tcp:127.0.0.1:{DEFAULT_PORT}"
-        ) from error
+        raise BusError(f"cannot listen on {where}: {error.strerror}; use --bus tcp:127.0.0.1:{DEFAULT_PORT}") from error
     return listener
 
 

@@ -68,9 +68,7 @@ class InprocEcu:
             text = self.library.diarc_inproc_status_text(status).decode()
             name = self.library.diarc_inproc_parameter_name(entry.value).decode()
             raise ConfigError(f"the firmware refuses its parameters: the image {text} (parameter {name})")
-        self.begin = _CFunction(
-            ctypes.cast(self.library.diarc_inproc_begin, ctypes.c_void_p).value or 0, _BEGIN
-        )
+        self.begin = _CFunction(ctypes.cast(self.library.diarc_inproc_begin, ctypes.c_void_p).value or 0, _BEGIN)
         self.end = _CFunction(ctypes.cast(self.library.diarc_inproc_end, ctypes.c_void_p).value or 0, _END)
 
     def tick_begin(self) -> np.ndarray:

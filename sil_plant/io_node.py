@@ -98,9 +98,7 @@ def node_layout() -> NodeLayout:
         valves_id=protocol.frame_id("VALVES"),
         angles=protocol.layout("ENCODERS", ("SwingAngle", "WristAngle")),
         pressures=protocol.layout("PRESSURES_SWING", pressures),
-        valves=protocol.layout(
-            "VALVES", ("SwingSpool", "WristSpool", "SwingControl", "WristControl", "SyncCounter")
-        ),
+        valves=protocol.layout("VALVES", ("SwingSpool", "WristSpool", "SwingControl", "WristControl", "SyncCounter")),
         angle_step=protocol.scale("ENCODERS", "SwingAngle"),
         pressure_step=protocol.scale("PRESSURES_SWING", "BorePressure") * 1e5,
         spool_step=protocol.scale("PRESSURES_SWING", "SpoolPosition") / 100.0,

@@ -211,7 +211,9 @@ def load_machine(path: Path) -> Machine:
         if key not in ranges:
             raise toml.error(key, "is not a key of a machine file; see sil_plant/arms/reference.toml")
         values[key] = toml.number(key, value, *ranges[key])
-    optional = set(EFFECTS) | {f"estimator.prior.{e.name.split('.')[2]}.value" for e in table.entries if ".prior." in e.name}
+    optional = set(EFFECTS) | {
+        f"estimator.prior.{e.name.split('.')[2]}.value" for e in table.entries if ".prior." in e.name
+    }
     for key in ranges:
         if key not in values and key not in optional:
             raise toml.error(key, "is missing")
@@ -239,9 +241,7 @@ def _check_relations(toml: TomlFile, values: dict[str, float]) -> None:
         stem = key.removesuffix(".sd")
         low, value, high = (values[f"{stem}.{part}"] for part in ("low", "value", "high"))
         if not low < high or not low <= value <= high:
-            raise toml.error(
-                key, f"its prior needs low < high and low <= value <= high: {low:g}, {value:g}, {high:g}"
-            )
+            raise toml.error(key, f"its prior needs low < high and low <= value <= high: {low:g}, {value:g}, {high:g}")
 
 
 def with_changes(machine: Machine, changes: dict[str, float], where: str) -> Machine:

@@ -209,9 +209,7 @@ def derivative(y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters,
         dy[P_SWING + 2 * i] = bulk_modulus(p1, p) / volume1 * (-p.area1[i] * x_rate + flow1 - leak)
         dy[P_SWING + 2 * i + 1] = bulk_modulus(p2, p) / volume2 * (p.area2[i] * x_rate - flow2 + leak)
         dy[XV + i] = xv_rate
-        dy[XV_RATE + i] = (
-            p.valve_w[i] * p.valve_w[i] * (u[i] - xv) - 2.0 * p.valve_damping[i] * p.valve_w[i] * xv_rate
-        )
+        dy[XV_RATE + i] = p.valve_w[i] * p.valve_w[i] * (u[i] - xv) - 2.0 * p.valve_damping[i] * p.valve_w[i] * xv_rate
         force = p1 * p.area1[i] - p2 * p.area2[i] + end_contact(x, x_rate, p.stroke[i])
         friction = friction_torque(w, lever, i, p)
         if i == 0:
@@ -249,7 +247,7 @@ def integrate(
     scratch : np.ndarray
         Work space, shape (5, 12).
     """
-    steps = int(math.ceil(duration_s / LONGEST_STEP_S - 1e-9))
+    steps = math.ceil(duration_s / LONGEST_STEP_S - 1e-9)
     if steps <= 0:
         return
     h = duration_s / steps

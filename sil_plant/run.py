@@ -22,7 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import enter, say  # noqa: E402
+from sil_plant.environment import enter, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -54,21 +54,13 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         prog="run.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--load", type=float, metavar="KG", help="load at the tip; default: the scenario's")
-    parser.add_argument(
-        "--bus", default="vcan0", metavar="BUS", help="vcan0 (default), can0, tcp:HOST:PORT, inproc"
-    )
+    parser.add_argument("--bus", default="vcan0", metavar="BUS", help="vcan0 (default), can0, tcp:HOST:PORT, inproc")
     parser.add_argument(
         "--ecu", choices=("external", "spawn"), default="external", help="use an ECU that runs, or start one"
     )
-    parser.add_argument(
-        "--pace", choices=("realtime", "strict", "lockstep"), help="of a spawned ECU; default realtime"
-    )
-    parser.add_argument(
-        "--duration", type=float, metavar="S", help="of the motion; default: the scenario's, 10"
-    )
-    parser.add_argument(
-        "--seed", type=int, metavar="N", help="of the sensor noise; default: the scenario's, 1"
-    )
+    parser.add_argument("--pace", choices=("realtime", "strict", "lockstep"), help="of a spawned ECU; default realtime")
+    parser.add_argument("--duration", type=float, metavar="S", help="of the motion; default: the scenario's, 10")
+    parser.add_argument("--seed", type=int, metavar="N", help="of the sensor noise; default: the scenario's, 1")
     parser.add_argument("--controller", choices=session.CONTROLLERS, default="diarc")
     parser.add_argument("--params", type=Path, metavar="FILE", help="commissioned set from tools/commission.py")
     parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")
@@ -76,9 +68,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         "--profile", choices=PROFILE_NAMES, default="paper", help="how kind the plant is; default paper"
     )
     parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, metavar="FILE")
-    parser.add_argument(
-        "--scalar", choices=inproc.SCALARS, default="double", help="number type of the law, in process"
-    )
+    parser.add_argument("--scalar", choices=inproc.SCALARS, default="double", help="number type of the law, in process")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the trace, one row per tick")
     parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
@@ -104,9 +94,7 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     if address.kind == "inproc" and arguments.ecu == "spawn":
         raise ConfigError("--ecu spawn needs a bus: --bus vcan0 or --bus tcp:127.0.0.1:29536")
     if address.kind != "inproc" and arguments.scalar != "double":
-        raise ConfigError(
-            "--scalar is for --bus inproc; an ECU on a bus has the number type it was built with"
-        )
+        raise ConfigError("--scalar is for --bus inproc; an ECU on a bus has the number type it was built with")
     if arguments.arm != REFERENCE_ARM and address.kind != "inproc" and arguments.ecu != "spawn":
         say("run.py: note: the ECU on the bus must have been started with this machine's --params")
     profile = load_profile(arguments.profile)
@@ -144,7 +132,7 @@ def write_outputs(arguments: argparse.Namespace, record: session.Record, run: re
     if arguments.csv:
         results.write_csv(arguments.csv, record, run)
     if not arguments.quiet:
-        print(results.table(result, protocol.worst_case_bus_load()))
+        show(results.table(result, protocol.worst_case_bus_load()))
     return result
 
 
@@ -180,9 +168,7 @@ def main(argv: list[str]) -> int:
     )  # fmt: skip
     with bar:
         task = bar.add_task("arm moving", total=len(run.noise))
-        progress: Callable[[int], None] = (
-            (lambda tick: bar.update(task, completed=tick)) if show else (lambda _: None)
-        )
+        progress: Callable[[int], None] = (lambda tick: bar.update(task, completed=tick)) if show else (lambda _: None)
         try:
             if inputs.address.kind == "inproc":
                 wall_s = execution.in_process(run, image, arguments.scalar, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -137,18 +138,14 @@ def _segments(toml: TomlFile, joint: str) -> tuple[Segment, ...]:
             raise toml.error(key, "a table with target_rad, duration_s and dwell_s is needed")
         for name in item:
             if name not in SEGMENT_KEYS:
-                raise toml.error(
-                    f"{key}.{name}", f"is not a key of a segment; known are {sorted(SEGMENT_KEYS)}"
-                )
+                raise toml.error(f"{key}.{name}", f"is not a key of a segment; known are {sorted(SEGMENT_KEYS)}")
         for name in ("target_rad", "duration_s"):
             if name not in item:
                 raise toml.error(key, f"{name} is missing")
         segments.append(
             Segment(
                 target_rad=toml.number(f"{key}.target_rad", item["target_rad"], -3.14, 3.14),
-                duration_s=toml.number(
-                    f"{key}.duration_s", item["duration_s"], SHORTEST_MOVE_S, LONGEST_MOVE_S
-                ),
+                duration_s=toml.number(f"{key}.duration_s", item["duration_s"], SHORTEST_MOVE_S, LONGEST_MOVE_S),
                 dwell_s=toml.number(f"{key}.dwell_s", item.get("dwell_s", 0.0), 0.0, LONGEST_RUN_S),
             )
         )
@@ -169,7 +166,7 @@ def _load_steps(toml: TomlFile) -> tuple[LoadStep, ...]:
                 toml.number("load.load_kg", item["load_kg"], 0.0, HEAVIEST_KG),
             )
         )
-    if steps[0].time_s != 0.0 or any(a.time_s >= b.time_s for a, b in zip(steps, steps[1:], strict=False)):
+    if steps[0].time_s != 0.0 or any(a.time_s >= b.time_s for a, b in itertools.pairwise(steps)):
         raise toml.error("load", "the first step must be at time_s = 0, the others in order of time")
     return tuple(steps)
 
@@ -192,9 +189,7 @@ def check_scenario(scenario: Scenario, machine: Machine) -> None:
         poses = [scenario.start_pose_rad[joint], *(s.target_rad for s in scenario.segments[joint])]
         for pose in poses:
             if not low <= pose <= high:
-                raise ConfigError(
-                    f"{name}: {pose:g} rad is outside the joint's range {low:g} to {high:g} rad"
-                )
+                raise ConfigError(f"{name}: {pose:g} rad is outside the joint's range {low:g} to {high:g} rad")
     highest = machine["estimator.prior.m_t_kg.high"]
     for step in scenario.load:
         if not 0.0 <= step.load_kg <= highest:
@@ -251,7 +246,6 @@ def load_profile(name: str) -> Profile:
         tare=bool(data.get("tare", False)),
         machine={k: toml.number(f"machine.{k}", v, -1e12, 1e12) for k, v in flatten(data.get("machine", {}))},
         effects={
-            f"effects.{k}": toml.number(f"effects.{k}", v, -1e12, 1e12)
-            for k, v in flatten(data.get("effects", {}))
+            f"effects.{k}": toml.number(f"effects.{k}", v, -1e12, 1e12) for k, v in flatten(data.get("effects", {}))
         },
     )

@@ -265,9 +265,7 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
         rows.append(
             (
                 tick,
-                motion_frame(
-                    counter, REQUEST_MOVE, joint, target_rad=segment.target_rad, duration_ms=duration_ms
-                ),
+                motion_frame(counter, REQUEST_MOVE, joint, target_rad=segment.target_rad, duration_ms=duration_ms),
             )
         )
         move_tick.append(tick)
@@ -482,9 +480,7 @@ def on_frame(session: Session, row: np.ndarray) -> None:
         f = layout.tracking
         joint = get(row, f[0, 0], f[0, 1], 0)
         if joint < 2:
-            session.monitor.reference[joint] = (
-                get(row, f[1 + joint, 0], f[1 + joint, 1], 1) * layout.angle_step
-            )
+            session.monitor.reference[joint] = get(row, f[1 + joint, 0], f[1 + joint, 1], 1) * layout.angle_step
     elif can_id == layout.parameters_id and intact(row):
         f = layout.parameters  # all parameters stand at the same place, each with its own scale
         n = get(row, f[0, 0], f[0, 1], 0)

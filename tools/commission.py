@@ -1,6 +1,7 @@
 """Commission a machine: move it without load, find every parameter but the load, store the set.
 
-Examples:
+Examples
+--------
   python tools/commission.py                                   in process, paper's plant
   python tools/commission.py --profile realistic -o out/arm.toml
   python tools/commission.py --bus vcan0 --ecu spawn           starts the ECU with commissioning priors
@@ -19,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import enter, say  # noqa: E402
+from sil_plant.environment import enter, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -61,9 +62,7 @@ def move(arguments: argparse.Namespace, machine: Machine) -> session.Session:
     plant = with_changes(plant, scenario.plant | {"effects.viscosity_factor": 1.0}, str(arguments.scenario))
     execution.compile_plant(machine, scenario)
     try:
-        run = session.make_session(
-            plant, scenario, "diarc", arguments.seed, execution.PERIOD_US * 1e-6, profile.tare
-        )
+        run = session.make_session(plant, scenario, "diarc", arguments.seed, execution.PERIOD_US * 1e-6, profile.tare)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     image = parameter_image(commissioning.commissioning_machine(machine))
@@ -87,7 +86,9 @@ def main(argv: list[str]) -> int:
         machine = with_changes(plain, profile.machine, f"profile {profile.name}")
         if arguments.write_image:
             arguments.write_image.write_bytes(parameter_image(commissioning.commissioning_machine(machine)))
-            print(f"wrote {arguments.write_image}; start the ECU with it: diarc_ecu BUS --params {arguments.write_image}")
+            show(
+                f"wrote {arguments.write_image}; start the ECU with it: diarc_ecu BUS --params {arguments.write_image}"
+            )
             return 0
         output = arguments.output or ROOT / "out" / f"{machine.name}.commissioned.toml"
         if arguments.output is None:
@@ -101,7 +102,7 @@ def main(argv: list[str]) -> int:
                 "--write-image, or use --ecu spawn"
             )
         found = commissioning.findings(machine, run.monitor)
-        print(commissioning.table(found))
+        show(commissioning.table(found))
         commissioning.check_excitation(found)
         output.write_text(commissioning.to_toml(machine, found, profile.name), encoding="utf-8")
         image = output.with_suffix(".params")
@@ -118,7 +119,7 @@ def main(argv: list[str]) -> int:
     except KeyboardInterrupt:
         say("commission.py: interrupted; nothing was stored")
         return EXIT_INTERRUPTED
-    print(f"\nwrote {output} for run.py --params, {image} for diarc_ecu --params")
+    show(f"\nwrote {output} for run.py --params, {image} for diarc_ecu --params")
     return 0
 
 

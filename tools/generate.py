@@ -117,8 +117,7 @@ def parameter_sources() -> dict[Path, str]:
         names.append(f'    "{entry.name}",\n')
     image = parameter_image(load_machine(REFERENCE_ARM))
     lines = [
-        "    " + ", ".join(f"0x{byte:02X}" for byte in image[at : at + 16]) + ",\n"
-        for at in range(0, len(image), 16)
+        "    " + ", ".join(f"0x{byte:02X}" for byte in image[at : at + 16]) + ",\n" for at in range(0, len(image), 16)
     ]
     count_header = (
         NOTICE
@@ -151,9 +150,7 @@ def generate() -> dict[Path, str]:
 
 def main() -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="compare instead of writing")
     arguments = parser.parse_args()
     stale = []

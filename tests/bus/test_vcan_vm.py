@@ -218,9 +218,7 @@ def tour(vcan_vm: Path, tmp_path_factory: pytest.TempPathFactory) -> Tour:
         "SECRET": "not for inside",
         "NUMBA_CACHE_DIR": str(base / "cache"),
     }
-    subprocess.run(
-        [sys.executable, "cached.py", outside], cwd=directory, env=environment, timeout=60, check=True
-    )
+    subprocess.run([sys.executable, "cached.py", outside], cwd=directory, env=environment, timeout=60, check=True)
     settings = json.dumps([str(report), TOUR_STATUS, ROUND_TRIPS, TICKS, ["cached.py", str(inside)]])
     options = ["--timeout", "60", "--interface", "vcan0", "--interface", "can1"]
     run = subprocess.run(
@@ -438,9 +436,7 @@ def hanging(vcan_vm: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 def test_output_is_not_held_back_until_the_end(hanging: dict[str, Hanging]) -> None:
     """GIVEN several machines at once with hanging commands WHEN they wrote a line THEN we have it."""
     assert {machine.first_line for machine in hanging.values()} == {b"started\n"}
-    assert all(
-        living_members(machine.group) for machine in hanging.values() if machine.process.poll() is None
-    )
+    assert all(living_members(machine.group) for machine in hanging.values() if machine.process.poll() is None)
 
 
 @pytest.mark.parametrize(
