@@ -1,0 +1,258 @@
+/* The number of the law (control/scalar) against libm and against exact arithmetic. */
+#include <float.h>
+
+#include "testing.h"
+
+/* The bounds of scalar.h. */
+#if defined(DIARC_SCALAR_DOUBLE)
+#define SINE_BOUND 5e-16
+#define ARCTANGENT_BOUND 7e-16
+#define HALF_DIGITS 26 /* numbers this long have exact squares */
+#define SCALAR_MAX DBL_MAX
+#define SCALAR_TRUE_MIN 4.9406564584124654e-324
+#else
+#define SINE_BOUND 2.8e-7
+#define ARCTANGENT_BOUND 1.5e-7
+#define HALF_DIGITS 12
+#define SCALAR_MAX FLT_MAX
+#define SCALAR_TRUE_MIN 1.40129846e-45f
+#endif
+
+static const scalar NOT_A_NUMBER = (scalar)NAN;
+static const scalar INFINITE = (scalar)INFINITY;
+
+void setUp(void)
+{
+}
+
+void tearDown(void)
+{
+}
+
+static scalar next_up(scalar x)
+{
+#if defined(DIARC_SCALAR_DOUBLE)
+    return nextafter(x, (double)INFINITY);
+#else
+    return nextafterf(x, INFINITY);
+#endif
+}
+
+static scalar next_down(scalar x)
+{
+    return -next_up(-x);
+}
+
+/* Libm in long double is the truth: its own error is far below the bounds. */
+static void expect_sine_and_cosine(scalar x)
+{
+    TEST_ASSERT_DOUBLE_WITHIN(SINE_BOUND, 0, (double)((long double)sine(x) - sinl((long double)x)));
+    TEST_ASSERT_DOUBLE_WITHIN(SINE_BOUND, 0, (double)((long double)cosine(x) - cosl((long double)x)));
+}
+
+static void expect_arctangent(scalar x)
+{
+    TEST_ASSERT_DOUBLE_WITHIN(ARCTANGENT_BOUND, 0,
+                              (double)((long double)arctangent(x) - atanl((long double)x)));
+}
+
+static void test_sine_or_cosine_beyond_its_bound(void)
+{
+    /* GIVEN angles over both turns WHEN compared with libm THEN the error is what scalar.h says */
+    const int steps = 100000;
+    for (int k = -steps; k <= steps; k++) {
+        expect_sine_and_cosine(SCALAR(6.2831853 * k / steps));
+    }
+}
+
+static void test_sine_or_cosine_wrong_where_its_branches_meet(void)
+{
+    /* GIVEN the multiples of a quarter turn and their neighbours WHEN compared THEN no branch is worse */
+    for (int k = -4; k <= 4; k++) {
+        scalar x = SCALAR(k * PI_REAL / 2);
+        x = k == 4 ? next_down(x) : k == -4 ? next_up(x) : x; /* the range ends at 2 pi */
+        expect_sine_and_cosine(x);
+        expect_sine_and_cosine(k < 4 ? next_up(x) : x);
+        expect_sine_and_cosine(k > -4 ? next_down(x) : x);
+    }
+    expect_sine_and_cosine(SCALAR(SCALAR_TRUE_MIN));
+    TEST_ASSERT_TRUE(sine(SCALAR(0)) == SCALAR(0));
+}
+
+static void test_left_and_right_turns_differ(void)
+{
+    /* GIVEN an angle and its mirror image WHEN computed THEN the bits mirror too */
+    for (int k = 0; k <= 1000; k++) {
+        const scalar x = SCALAR(6.2831853 * k / 1000);
+        TEST_ASSERT_TRUE(sine(-x) == -sine(x));
+        TEST_ASSERT_TRUE(cosine(-x) == cosine(x));
+        TEST_ASSERT_TRUE(arctangent(-x) == -arctangent(x));
+    }
+}
+
+static void test_arctangent_beyond_its_bound(void)
+{
+    /* GIVEN arguments of every size WHEN compared with libm THEN the error is what scalar.h says */
+    for (double x = 1e-12; x < 1e12; x *= 1.0005) {
+        expect_arctangent(SCALAR(x));
+        expect_arctangent(SCALAR(-x));
+    }
+    for (int k = 0; k <= 30000; k++) {
+        expect_arctangent(SCALAR(k * 1e-4));
+    }
+}
+
+static void test_arctangent_wrong_where_its_branches_meet(void)
+{
+    /* GIVEN tan(pi/8), 1, tan(3 pi/8), zero and the largest WHEN compared THEN no branch is worse */
+    static const double corners[] = {0.41421356237309504880, 1.0, 2.41421356237309504880};
+    for (unsigned k = 0; k < COUNT_OF(corners); k++) {
+        expect_arctangent(SCALAR(corners[k]));
+        expect_arctangent(next_up(SCALAR(corners[k])));
+        expect_arctangent(next_down(SCALAR(corners[k])));
+    }
+    expect_arctangent(SCALAR(SCALAR_MAX));
+    expect_arctangent(SCALAR(SCALAR_TRUE_MIN));
+    expect_arctangent(INFINITE);
+    expect_arctangent(-INFINITE);
+    TEST_ASSERT_TRUE(arctangent(SCALAR(0)) == SCALAR(0));
+}
+
+static void test_root_of_a_negative_is_no_number(void)
+{
+    /* GIVEN a pressure drop that noise made negative WHEN rooted THEN 0 */
+    TEST_ASSERT_TRUE(root(SCALAR(-1e-6)) == SCALAR(0));
+    TEST_ASSERT_TRUE(root(-INFINITE) == SCALAR(0));
+    TEST_ASSERT_TRUE(root(NOT_A_NUMBER) == SCALAR(0));
+    TEST_ASSERT_TRUE(root(SCALAR(0)) == SCALAR(0));
+}
+
+static void test_root_not_correctly_rounded(void)
+{
+    /* GIVEN squares of short numbers WHEN rooted THEN the number itself, bit for bit */
+    for (int n = 1; n < 2048; n++) {
+        const double x = ldexp((1 << HALF_DIGITS) - n, -HALF_DIGITS);
+        TEST_ASSERT_TRUE(root(SCALAR(x * x)) == SCALAR(x));
+    }
+}
+
+static void test_limit_lets_something_through(void)
+{
+    /* GIVEN values around the bounds, infinities and NaN WHEN limited THEN each is within; NaN becomes low */
+    const scalar low = SCALAR(-1);
+    const scalar high = SCALAR(0.5);
+    TEST_ASSERT_TRUE(limit(SCALAR(0.25), low, high) == SCALAR(0.25));
+    TEST_ASSERT_TRUE(limit(low, low, high) == low);
+    TEST_ASSERT_TRUE(limit(high, low, high) == high);
+    TEST_ASSERT_TRUE(limit(next_down(low), low, high) == low);
+    TEST_ASSERT_TRUE(limit(next_up(high), low, high) == high);
+    TEST_ASSERT_TRUE(limit(INFINITE, low, high) == high);
+    TEST_ASSERT_TRUE(limit(-INFINITE, low, high) == low);
+    TEST_ASSERT_TRUE(limit(NOT_A_NUMBER, low, high) == low);
+}
+
+static void test_raw_rounded_to_even_or_down(void)
+{
+    /* GIVEN every half step WHEN encoded THEN it rounds away from zero; a bit less does not */
+    for (int k = 0; k < 2000; k++) {
+        const scalar half = SCALAR((k + 0.5) / 16384);
+        TEST_ASSERT_EQUAL_INT32(k + 1, scalar_to_raw(half, 14, -16384, 16384));
+        TEST_ASSERT_EQUAL_INT32(-k - 1, scalar_to_raw(-half, 14, -16384, 16384));
+        TEST_ASSERT_EQUAL_INT32(k, scalar_to_raw(SCALAR((k + 0.499) / 16384), 14, -16384, 16384));
+        TEST_ASSERT_EQUAL_INT32(-k, scalar_to_raw(SCALAR((k + 0.499) / -16384), 14, -16384, 16384));
+    }
+    /* the last half step below the end of 24 bits, where a float has no bit to spare */
+    TEST_ASSERT_EQUAL_INT32(4194304, scalar_to_raw(SCALAR(4194303.5), 0, -8388607, 8388607));
+    TEST_ASSERT_EQUAL_INT32(-4194304, scalar_to_raw(SCALAR(-4194303.5), 0, -8388607, 8388607));
+}
+
+static void test_raw_wraps_instead_of_saturating(void)
+{
+    /* GIVEN values at and beyond the ends WHEN encoded THEN the ends */
+    TEST_ASSERT_EQUAL_INT32(16384, scalar_to_raw(SCALAR(1), 14, -16384, 16384));
+    TEST_ASSERT_EQUAL_INT32(-16384, scalar_to_raw(SCALAR(-1), 14, -16384, 16384));
+    TEST_ASSERT_EQUAL_INT32(16384, scalar_to_raw(SCALAR(1.001), 14, -16384, 16384));
+    TEST_ASSERT_EQUAL_INT32(-16384, scalar_to_raw(SCALAR(-1.001), 14, -16384, 16384));
+    TEST_ASSERT_EQUAL_INT32(8388607, scalar_to_raw(SCALAR(8388606.75), 0, -8388607, 8388607));
+    TEST_ASSERT_EQUAL_INT32(-8388607, scalar_to_raw(SCALAR(-8388606.75), 0, -8388607, 8388607));
+    TEST_ASSERT_EQUAL_INT32(65535, scalar_to_raw(SCALAR(70000), 0, 0, 65535));
+    TEST_ASSERT_EQUAL_INT32(0, scalar_to_raw(SCALAR(-3), 0, 0, 65535));
+    TEST_ASSERT_EQUAL_INT32(INT32_MAX, scalar_to_raw(SCALAR(3e9), 0, INT32_MIN, INT32_MAX));
+    TEST_ASSERT_EQUAL_INT32(INT32_MIN, scalar_to_raw(SCALAR(-3e9), 0, INT32_MIN, INT32_MAX));
+    TEST_ASSERT_EQUAL_INT32(8388607, scalar_to_raw(INFINITE, 0, -8388607, 8388607));
+    TEST_ASSERT_EQUAL_INT32(-8388607, scalar_to_raw(-INFINITE, 0, -8388607, 8388607));
+}
+
+static void test_raw_of_nan_undefined(void)
+{
+    /* GIVEN no number WHEN encoded THEN the low end, not whatever the processor makes of it */
+    TEST_ASSERT_EQUAL_INT32(-8388607, scalar_to_raw(NOT_A_NUMBER, 21, -8388607, 8388607));
+    TEST_ASSERT_EQUAL_INT32(0, scalar_to_raw(NOT_A_NUMBER, 14, 0, 65535));
+}
+
+static void test_raw_does_not_come_back(void)
+{
+    /* GIVEN raw values of 24 bits WHEN decoded THEN exact; WHEN encoded again THEN the same raw value */
+    TEST_ASSERT_TRUE(scalar_from_raw(1, 31) == SCALAR(0x1p-31));
+    TEST_ASSERT_TRUE(scalar_from_raw(-3, 0) == SCALAR(-3));
+    TEST_ASSERT_TRUE(scalar_from_raw(-8388607, 21) == SCALAR(-8388607 * 0x1p-21));
+    for (int32_t raw = -8388607; raw <= 8388607; raw += 997) {
+        const scalar x = scalar_from_raw(raw, 22);
+        TEST_ASSERT_TRUE(x == SCALAR(raw * 0x1p-22));
+        TEST_ASSERT_EQUAL_INT32(raw, scalar_to_raw(x, 22, -8388607, 8388607));
+    }
+}
+
+static void expect_real32(float value, int8_t exponent)
+{
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    const scalar expected = SCALAR(ldexp((double)value, -exponent)); /* exact: a power of two */
+    TEST_ASSERT_TRUE(scalar_from_real32(bits, exponent) == expected);
+    TEST_ASSERT_TRUE(gain_from_real32(bits, exponent) == GAIN(expected));
+}
+
+static void test_parameter_bits_read_inexactly(void)
+{
+    /* GIVEN binary32 numbers of all kinds and bases as powers of two WHEN read THEN exact */
+    static const float values[] = {0.0f, 1.0f,    -1.0f,   9.81f,   -0.7f,
+                                   1e7f, 3.4e-8f, FLT_MAX, FLT_MIN, 1.9999999f};
+    for (unsigned k = 0; k < COUNT_OF(values); k++) {
+        expect_real32(values[k], 0);
+        expect_real32(-values[k], 0);
+    }
+    expect_real32(1e7f, 22);    /* supply pressure */
+    expect_real32(2e-13f, -37); /* leakage */
+    expect_real32(-1e-6f, -15); /* a flow offset */
+    expect_real32(FLT_MAX, 96); /* the ends of the exponent */
+    expect_real32(FLT_MIN, -96);
+}
+
+static void test_subnormal_parameter_gets_a_hidden_bit(void)
+{
+    /* GIVEN subnormal binary32 numbers WHEN read THEN no hidden bit is added to them */
+    expect_real32(1.40129846e-45f, 0);
+    expect_real32(1.40129846e-45f, -96);
+    expect_real32(-5.87747175e-39f, -20);
+    expect_real32(1.17549421e-38f, -96);
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_sine_or_cosine_beyond_its_bound);
+    RUN_TEST(test_sine_or_cosine_wrong_where_its_branches_meet);
+    RUN_TEST(test_left_and_right_turns_differ);
+    RUN_TEST(test_arctangent_beyond_its_bound);
+    RUN_TEST(test_arctangent_wrong_where_its_branches_meet);
+    RUN_TEST(test_root_of_a_negative_is_no_number);
+    RUN_TEST(test_root_not_correctly_rounded);
+    RUN_TEST(test_limit_lets_something_through);
+    RUN_TEST(test_raw_rounded_to_even_or_down);
+    RUN_TEST(test_raw_wraps_instead_of_saturating);
+    RUN_TEST(test_raw_of_nan_undefined);
+    RUN_TEST(test_raw_does_not_come_back);
+    RUN_TEST(test_parameter_bits_read_inexactly);
+    RUN_TEST(test_subnormal_parameter_gets_a_hidden_bit);
+    return UNITY_END();
+}

@@ -1,0 +1,192 @@
+/* Point-to-point moves (control/trajectory): 0.6 rad in 1.5 s at 1 kHz, as in the paper's benchmark. */
+#include <float.h>
+
+#include "control/trajectory.h"
+#include "testing.h"
+
+/* Of angles of order one; rates and accelerations are checked numerically over SPAN ticks. */
+#if defined(DIARC_SCALAR_DOUBLE)
+#define ULP DBL_EPSILON
+#define TOLERANCE 1e-13
+#define SLOPE_TOLERANCE 2e-6
+#else
+#define ULP ((double)FLT_EPSILON)
+#define TOLERANCE 1e-5
+#define SLOPE_TOLERANCE 3e-4
+#endif
+
+enum { TICKS = 1500, SPAN = 10 };
+
+static const double DT_S = 1e-3;
+static const double START_RAD = -0.2;
+static const double TARGET_RAD = 0.4;
+static const double DISTANCE_RAD = 0.6;
+static const double DURATION_S = 1.5;
+
+static struct trajectory trajectory;
+static struct reference samples[TICKS + 1];
+
+void setUp(void)
+{
+    trajectory = trajectory_at_rest(SCALAR(START_RAD));
+}
+
+void tearDown(void)
+{
+}
+
+static bool begin(void)
+{
+    return trajectory_start(&trajectory, SCALAR(TARGET_RAD), TICKS, SCALAR(DT_S));
+}
+
+/* The whole move, both ends included. */
+static void record(void)
+{
+    TEST_ASSERT_TRUE(begin());
+    for (int k = 0; k <= TICKS; k++) {
+        samples[k] = trajectory_now(&trajectory);
+        trajectory_advance(&trajectory);
+    }
+}
+
+static void test_move_does_not_begin_at_rest(void)
+{
+    /* GIVEN rest WHEN a move starts THEN its first sample is the start, exactly and without rate */
+    TEST_ASSERT_TRUE(begin());
+    const struct reference first = trajectory_now(&trajectory);
+    TEST_ASSERT_TRUE(first.q == SCALAR(START_RAD));
+    TEST_ASSERT_TRUE(first.w == SCALAR(0));
+    TEST_ASSERT_TRUE(first.a == SCALAR(0));
+}
+
+static void test_move_does_not_end_at_rest_at_its_target(void)
+{
+    /* GIVEN a move WHEN its last tick has passed THEN it rests at the target, after that many ticks, not one
+     * less */
+    record();
+    TEST_ASSERT_DOUBLE_WITHIN(ULP, TARGET_RAD, real(samples[TICKS].q));
+    TEST_ASSERT_TRUE(samples[TICKS].w == SCALAR(0));
+    TEST_ASSERT_TRUE(samples[TICKS].a == SCALAR(0));
+    TEST_ASSERT_TRUE(samples[TICKS - 1].w > SCALAR(0));
+    TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
+}
+
+static void test_end_point_creeps_away_over_many_moves(void)
+{
+    /* GIVEN a thousand moves to and fro WHEN each has ended THEN its end is the target, whatever came before
+     * */
+    struct lcg noise = {3};
+    for (int n = 0; n < 1000; n++) {
+        const scalar target = SCALAR(lcg_uniform(&noise, -1, 1.2));
+        TEST_ASSERT_TRUE(trajectory_start(&trajectory, target, 7, SCALAR(DT_S)));
+        for (int k = 0; k < 7; k++) {
+            trajectory_advance(&trajectory);
+        }
+        TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
+        TEST_ASSERT_DOUBLE_WITHIN(2 * ULP, real(target), real(trajectory_now(&trajectory).q));
+    }
+}
+
+static void test_acceleration_or_jerk_jumps(void)
+{
+    /* GIVEN a whole move, ends included WHEN the acceleration is followed THEN it never steps by more than
+     * the profile's greatest jerk allows, |s'''| <= 52.5, and hardly at all near the ends, where jerk is zero
+     * */
+    record();
+    const double step = 52.5 * DISTANCE_RAD / (DURATION_S * DURATION_S * DURATION_S) * DT_S;
+    double greatest = 0;
+    for (int k = 0; k < TICKS; k++) {
+        greatest = fmax(greatest, fabs(real(samples[k + 1].a) - real(samples[k].a)));
+    }
+    TEST_ASSERT_TRUE(greatest < step * 1.001 + TOLERANCE);
+    TEST_ASSERT_TRUE(greatest > step * 0.99 - TOLERANCE);
+    TEST_ASSERT_DOUBLE_WITHIN(step / 50, 0, real(samples[1].a));
+    TEST_ASSERT_DOUBLE_WITHIN(step / 50, 0, real(samples[TICKS - 1].a));
+}
+
+static void test_rate_is_not_the_slope_of_the_angle(void)
+{
+    /* GIVEN a whole move WHEN angle and rate are differentiated THEN rate and acceleration, in SI */
+    record();
+    const double h = SPAN * DT_S;
+    for (int k = 2 * SPAN; k <= TICKS - 2 * SPAN; k++) {
+        const struct reference *const s = &samples[k];
+        const double slope_q =
+            (8 * (real(s[SPAN].q) - real(s[-SPAN].q)) - (real(s[2 * SPAN].q) - real(s[-2 * SPAN].q))) /
+            (12 * h);
+        const double slope_w =
+            (8 * (real(s[SPAN].w) - real(s[-SPAN].w)) - (real(s[2 * SPAN].w) - real(s[-2 * SPAN].w))) /
+            (12 * h);
+        TEST_ASSERT_DOUBLE_WITHIN(SLOPE_TOLERANCE, real(s->w), slope_q);
+        TEST_ASSERT_DOUBLE_WITHIN(3 * SLOPE_TOLERANCE, real(s->a), slope_w);
+    }
+}
+
+static void test_profile_is_another(void)
+{
+    /* GIVEN a whole move WHEN it is half over THEN half the way at the greatest rate, 140/64 of the mean, and
+     * it never leaves the way between its ends */
+    record();
+    TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, (START_RAD + TARGET_RAD) / 2, real(samples[TICKS / 2].q));
+    TEST_ASSERT_DOUBLE_WITHIN(10 * TOLERANCE, 140.0 / 64 * DISTANCE_RAD / DURATION_S,
+                              real(samples[TICKS / 2].w));
+    TEST_ASSERT_DOUBLE_WITHIN(100 * TOLERANCE, 0, real(samples[TICKS / 2].a));
+    for (int k = 0; k < TICKS; k++) {
+        TEST_ASSERT_TRUE(real(samples[k].q) >= START_RAD - TOLERANCE);
+        TEST_ASSERT_TRUE(real(samples[k].q) <= TARGET_RAD + TOLERANCE);
+    }
+}
+
+static void test_new_target_takes_over_half_way(void)
+{
+    /* GIVEN a move under way WHEN another is asked for THEN refused, and the first goes on undisturbed */
+    TEST_ASSERT_TRUE(begin());
+    for (int k = 0; k < 700; k++) {
+        trajectory_advance(&trajectory);
+    }
+    const struct trajectory before = trajectory;
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(-0.9), 100, SCALAR(DT_S)));
+    TEST_ASSERT_EQUAL_MEMORY(&before, &trajectory, sizeof before);
+    TEST_ASSERT_TRUE(trajectory_moving(&trajectory));
+}
+
+static void test_move_in_no_time_jumps(void)
+{
+    /* GIVEN rest WHEN a move of 0 ticks, or of more than can be counted, is asked for THEN refused, still at
+     * rest */
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(TARGET_RAD), 0, SCALAR(DT_S)));
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(TARGET_RAD), UINT32_MAX, SCALAR(DT_S)));
+    TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
+    TEST_ASSERT_TRUE(trajectory_now(&trajectory).q == SCALAR(START_RAD));
+}
+
+static void test_rest_drifts(void)
+{
+    /* GIVEN a finished move WHEN time goes on THEN nothing moves any more, and the next move may start */
+    record();
+    const struct reference end = trajectory_now(&trajectory);
+    for (int k = 0; k < 1000; k++) {
+        trajectory_advance(&trajectory);
+        const struct reference now = trajectory_now(&trajectory);
+        TEST_ASSERT_TRUE(now.q == end.q && now.w == SCALAR(0) && now.a == SCALAR(0));
+    }
+    TEST_ASSERT_TRUE(trajectory_start(&trajectory, SCALAR(START_RAD), 1, SCALAR(DT_S)));
+    trajectory_advance(&trajectory);
+    TEST_ASSERT_DOUBLE_WITHIN(ULP, START_RAD, real(trajectory_now(&trajectory).q));
+}
+
+int main(void)
+{
+    UNITY_BEGIN();
+    RUN_TEST(test_move_does_not_begin_at_rest);
+    RUN_TEST(test_move_does_not_end_at_rest_at_its_target);
+    RUN_TEST(test_end_point_creeps_away_over_many_moves);
+    RUN_TEST(test_acceleration_or_jerk_jumps);
+    RUN_TEST(test_rate_is_not_the_slope_of_the_angle);
+    RUN_TEST(test_profile_is_another);
+    RUN_TEST(test_new_target_takes_over_half_way);
+    RUN_TEST(test_move_in_no_time_jumps);
+    RUN_TEST(test_rest_drifts);
+    return UNITY_END();
+}
