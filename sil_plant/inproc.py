@@ -15,7 +15,7 @@ from sil_plant.protocol import SYNC_ID
 from sil_plant.session import OUT_ROWS, Session, on_frame, on_sync
 
 LIBRARIES = ROOT / "build" / "lib"
-SCALARS = ("double", "float")
+SCALARS = ("double", "float", "fixed")
 TX_ROWS = 16
 
 _BEGIN = types.int32(types.uintp, types.uintp, types.int32)

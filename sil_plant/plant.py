@@ -94,7 +94,7 @@ def plant_parameters(machine: Machine) -> PlantParameters:
         L2=machine["wrist.link_length_m"],
         m2=machine["wrist.mass_kg"],
         J=machine["wrist.mass_kg"] * machine["wrist.link_length_m"] ** 2 / 3.0,
-        coulomb_slope=machine["arm.coulomb_slope_s_rad"],
+        coulomb_slope=1.0 / machine["arm.coulomb_rate_rad_s"],
         fv=pair("*.viscous_Nms_rad") * machine["effects.viscosity_factor"],
         fc=pair("*.coulomb_Nm"),
         area1=math.pi / 4.0 * bore**2,

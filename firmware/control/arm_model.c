@@ -15,7 +15,7 @@ struct wrist_trig wrist_trig(const struct arm *arm, scalar q2)
 
 scalar coulomb_sign(const struct arm *arm, scalar w)
 {
-    return mul(TWO_OVER_PI, arctangent(amp(arm->coulomb_slope, w)));
+    return mul(TWO_OVER_PI, arctangent(w, arm->coulomb_rate));
 }
 
 void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
@@ -65,15 +65,14 @@ void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, 
 }
 
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever,
-                          struct arm_row *row)
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever, struct arm_row *row)
 {
     arm_momentum(arm, t, i, a, row); /* H is linear in the same columns: H q'' is the momentum of a */
     if (i == SWING) {                /* dH11/dq2 q1' q2', Eq 3 */
         const scalar s_w1_w2 = mul(t->s, mul(w[SWING], w[WRIST]));
         const scalar L2_s_w1_w2 = mul(arm->L2, s_w1_w2);
-        row->phi[COL_M_T] -= SCALAR(2) * mul(L2_s_w1_w2, t->r);
-        row->phi[COL_J] -= SCALAR(2) * mul(t->c, s_w1_w2);
+        row->phi[COL_M_T] -= mul(SCALAR(2), mul(L2_s_w1_w2, t->r));
+        row->phi[COL_J] -= mul(SCALAR(2), mul(t->c, s_w1_w2));
         row->phi[COL_M2] -= mul(L2_s_w1_w2, arm->L1);
     } else {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);

@@ -25,11 +25,11 @@ extern const uint8_t row_parameter[JOINTS][ROW_COLUMNS];
 
 /* What of the arm is known for good. */
 struct arm {
-    scalar L1;          /* swing link, axis to wrist, m */
-    scalar L2;          /* wrist link, axis to tip, m */
-    scalar I1;          /* swing inertia about its axis, kg m^2 */
-    scalar g;           /* gravity, m/s^2 */
-    gain coulomb_slope; /* s(w) = (2/pi) atan(slope w), s/rad */
+    scalar L1;                   /* swing link, axis to wrist, m */
+    scalar L2;                   /* wrist link, axis to tip, m */
+    scalar I1;                   /* swing inertia about its axis, kg m^2 */
+    scalar g;                    /* gravity, m/s^2 */
+    scalar coulomb_rate;         /* s(w) = (2/pi) atan(w / rate), rad/s */
     scalar friction_at_cylinder; /* 0: at the joint; 1: at the cylinder, torques given at q = 0 */
 };
 
@@ -65,8 +65,7 @@ void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, 
 /* phi2(q, q', q''), Eq 14: row i of the inverse dynamics; phi' theta + known = R F. a in rad/s^2;
  * lever as above. */
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever,
-                          struct arm_row *row);
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever, struct arm_row *row);
 
 /* phi' theta + known, N m per unit. */
 scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar theta[THETA_M]);

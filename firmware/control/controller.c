@@ -73,8 +73,9 @@ static void estimate(struct controller *controller, const struct machine *machin
                                : SCALAR(1);
         const scalar opening = valve_opening(cylinder, measured->spool[i]);
         const bool extending = opening >= SCALAR(0);
-        sample->flow[i] = mul(opening, valve_gain(cylinder, &machine->supply, &sample->cylinder[i], p, extending)) -
-                          cylinder_leakage(cylinder, &sample->cylinder[i], p);
+        sample->flow[i] =
+            mul(opening, valve_gain(cylinder, &machine->supply, &sample->cylinder[i], p, extending)) -
+            cylinder_leakage(cylinder, &sample->cylinder[i], p);
     }
     estimator_step(&controller->estimator, &machine->estimator, &constants->estimator, &machine->arm, sample);
 }
@@ -131,8 +132,8 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     if (!controller->diarc[i].started) {
         diarc_start(&controller->diarc[i], &machine->diarc[i], &in);
     }
-    const struct diarc_output output =
-        diarc_step(&controller->diarc[i], &machine->diarc[i], &in, constants->dt_s);
+    const struct diarc_output output = diarc_step(&controller->diarc[i], &machine->diarc[i], &in,
+                                                  constants->dt_s, constants->estimator.per_tick);
     out->saturated = output.saturated;
     return output.u;
 }

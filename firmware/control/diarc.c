@@ -10,7 +10,7 @@ static scalar robust_gain(scalar bound, scalar eta, scalar most)
 {
     /* compared before dividing, so that a large bound cannot overflow */
     const scalar squared = mul(bound, bound);
-    const scalar four_eta = SCALAR(4) * eta;
+    const scalar four_eta = mul(SCALAR(4), eta);
     return squared < mul(most, four_eta) ? quot(squared, four_eta) : most;
 }
 
@@ -37,7 +37,7 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
      * H e2'^ from the model: H (q''^ - qd'') = R F - phi2' theta^ + gamma1. R' is left out: 0.1 % of it. */
     const scalar H_e2_rate =
         mul(R, in->force) - in->torque_ff + diarc->gamma1 + mul(H, amp(gains->k1, in->e1_rate));
-    const scalar gamma1_rate = mul(H, amp(gains->kappa1, s.e2));                         /* Eq 20 */
+    const scalar gamma1_rate = amp(gains->kappa1, mul(H, s.e2));                         /* Eq 20 */
     const scalar F_Ld_rate = quot(ff_rate - amp(gains->k2, H_e2_rate) - gamma1_rate, R); /* Eq 17 */
 
     /* step 2: flow */
@@ -65,12 +65,12 @@ void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const str
 }
 
 struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
-                               const struct diarc_input *in, scalar dt_s)
+                               const struct diarc_input *in, scalar dt_s, gain per_tick)
 {
     /* What the estimate took over, gamma1 gives back: adaptation alone moves no force. */
     diarc->gamma1 = symmetric_limit(diarc->gamma1 + in->torque_step, gains->gamma1_max);
     const scalar ff_before = diarc->torque_ff + in->torque_step;
-    const scalar ff_rate = quot(in->torque_ff - ff_before, dt_s);
+    const scalar ff_rate = amp(per_tick, in->torque_ff - ff_before);
     diarc->torque_ff = in->torque_ff;
 
     const struct two_steps s = two_steps(diarc, gains, in, ff_rate);
@@ -81,7 +81,7 @@ struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *ga
 
     /* gamma' = kappa e, integrated and then clamped, Eq 20 and 21; held while the valve cannot follow */
     if (!saturated) {
-        diarc->gamma1 = symmetric_limit(diarc->gamma1 + mul(dt_s, mul(in->H, amp(gains->kappa1, s.e2))),
+        diarc->gamma1 = symmetric_limit(diarc->gamma1 + mul(dt_s, amp(gains->kappa1, mul(in->H, s.e2))),
                                         gains->gamma1_max);
         diarc->gamma2 = symmetric_limit(
             diarc->gamma2 + mul(dt_s, mul(in->beta_inverse, amp(gains->kappa2, s.e3))), gains->gamma2_max);

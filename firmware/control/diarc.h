@@ -61,7 +61,8 @@ struct diarc_output {
  * passes at rest is the leakage. */
 void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in);
 
+/* One tick of dt_s; per_tick = 1 / dt_s. */
 struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
-                               const struct diarc_input *in, scalar dt_s);
+                               const struct diarc_input *in, scalar dt_s, gain per_tick);
 
 #endif

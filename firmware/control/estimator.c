@@ -7,60 +7,52 @@
  * another hold little that is new. */
 #define ROW_TURNS 4
 
-/* This many innovations in a row that are too large mean a changed load, and not one strange sample. */
+/* This many innovations in a row that are too large mean a changed load. */
 #define STRIKES 3
+
+/* The load's variance grows in steps of this many updates: one update's share is too small for short words. */
+#define WALK_UPDATES 50
 
 static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
     [SWING] = {BETA_INVERSE, OM2_SWING, OM3_SWING},
     [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
 };
 
-static scalar square(scalar x)
-{
-    return mul(x, x);
-}
-
 struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s)
 {
     struct estimator_constants constants = {0};
     constants.filter = quot(dt_s, parameters->filter_time + dt_s);
-    constants.per_tick = quot(SCALAR(1), dt_s);
+    constants.per_tick = gain_quot(SCALAR(1), dt_s);
+    constants.filter_rate = gain_quot(constants.filter, dt_s);
     for (uint8_t i = 0; i < JOINTS; i++) {
-        constants.residual_m[i] = quot(SCALAR(1), parameters->torque_noise[i]);
-        constants.residual_h[i] = quot(SCALAR(1), parameters->flow_noise[i]);
+        constants.noise_m[i] = variance_of(parameters->torque_noise[i]);
+        constants.noise_h[i] = variance_of(parameters->flow_noise[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
         constants.scale_m[k] = parameters->m[k].high - parameters->m[k].low;
         constants.step_m[k] = mul(constants.scale_m[k], amp(parameters->rate_limit, dt_s));
-        for (uint8_t i = 0; i < JOINTS; i++) {
-            constants.phi_m[i][k] = mul(constants.scale_m[k], constants.residual_m[i]);
-        }
     }
     for (uint8_t k = 0; k < THETA_H; k++) {
         constants.scale_h[k] = parameters->h[k].high - parameters->h[k].low;
         constants.step_h[k] = mul(constants.scale_h[k], amp(parameters->rate_limit, dt_s));
-        for (uint8_t i = 0; i < JOINTS; i++) {
-            constants.phi_h[i][k] = mul(constants.scale_h[k], constants.residual_h[i]);
-        }
     }
     /* two updates, one per row of the mechanics, every ROW_TURNS ticks */
-    constants.walk =
-        mul(square(quot(parameters->load_walk, constants.scale_m[M_T])), mul(dt_s, SCALAR(ROW_TURNS / 2)));
-    constants.load_variance = square(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
-    constants.innovation_limit_squared = square(parameters->innovation_limit);
+    const scalar walk_s = mul(dt_s, SCALAR(WALK_UPDATES * ROW_TURNS / 2));
+    constants.walk = scale_variance(variance_of(quot(parameters->load_walk, constants.scale_m[M_T])), walk_s);
+    constants.load_variance = variance_of(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
     return constants;
 }
 
 static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
                         scalar law[], struct ud_factors *covariance)
 {
-    scalar variance[UD_SIZE_MAX];
+    variance P[UD_SIZE_MAX];
     for (uint8_t k = 0; k < size; k++) {
         theta[k] = prior[k].value;
         law[k] = prior[k].value;
-        variance[k] = square(quot(prior[k].sd, scale[k]));
+        P[k] = variance_of(quot(prior[k].sd, scale[k]));
     }
-    ud_start(covariance, size, variance);
+    ud_start(covariance, size, P);
 }
 
 void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
@@ -105,6 +97,16 @@ static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
     filter->second += mul(pole_step, filter->first - filter->second);
 }
 
+/* The same of step / dt + x. */
+static void low_pass_rate(struct two_poles *filter, const struct estimator_constants *constants, scalar step,
+                          scalar x)
+{
+    filter->step += step - mul(constants->filter, filter->step);
+    filter->first += mul(constants->filter, x - filter->first);
+    const scalar first = filter->first + amp(constants->filter_rate, filter->step);
+    filter->second += mul(constants->filter, first - filter->second);
+}
+
 /* 0 at rest, 1 from twice the gate's rate on. */
 static scalar gate(const struct estimator_parameters *parameters, scalar reference_w)
 {
@@ -130,20 +132,20 @@ static void mechanics_balance(struct estimator *e, const struct estimator_consta
         const struct arm_row *const before = &e->previous_momentum[i];
         const scalar g = e->previous_gate[i];
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-            const scalar rate = amp(constants->per_tick, momentum.phi[k] - before->phi[k]);
-            low_pass(&e->row_m[i][k], constants->filter, mul(g, rate + force.phi[k]));
+            low_pass_rate(&e->row_m[i][k], constants, mul(g, momentum.phi[k] - before->phi[k]),
+                          mul(g, force.phi[k]));
         }
-        const scalar rate = amp(constants->per_tick, momentum.known - before->known);
         const scalar torque = mul(at->cylinder[i].R, at->force[i]);
-        low_pass(&e->row_m[i][ROW_COLUMNS], constants->filter, mul(g, rate + force.known - torque));
+        low_pass_rate(&e->row_m[i][ROW_COLUMNS], constants, mul(g, momentum.known - before->known),
+                      mul(g, force.known - torque));
     }
     e->previous_momentum[i] = momentum;
 }
 
 /* Flow balance of joint i over the sample (k-1, k), gated and filtered: Eq 6 in the form of Eq 25. */
 static void hydraulics_balance(struct estimator *e, const struct estimator_parameters *parameters,
-                               const struct estimator_constants *constants, enum joint i,
-                               scalar half_w, const struct estimator_sample *now)
+                               const struct estimator_constants *constants, enum joint i, scalar half_w,
+                               const struct estimator_sample *now)
 {
     const struct estimator_sample *const before = &e->previous;
     const struct cylinder_state *const c0 = &before->cylinder[i];
@@ -152,22 +154,21 @@ static void hydraulics_balance(struct estimator *e, const struct estimator_param
     const scalar noise = parameters->flow_noise[i];
     const scalar flow_error = mul(parameters->flow_error, absolute(before->flow[i]));
     const scalar g = mul(e->previous_gate[i], quot(noise, noise + flow_error));
-    const scalar force_rate = amp(constants->per_tick, now->force[i] - before->force[i]);
     const scalar displaced = mul(mul(half, mul(c0->lamA, c0->R) + mul(c1->lamA, c1->R)), half_w);
     const scalar flow = mul(half, before->flow[i] + now->flow[i]);
     struct two_poles *const row = e->row_h[i];
-    low_pass(&row[0], constants->filter, mul(g, force_rate));
+    low_pass_rate(&row[0], constants, mul(g, now->force[i] - before->force[i]), SCALAR(0));
     low_pass(&row[1], constants->filter, -mul(g, mul(half, c0->lamB + c1->lamB)));
     low_pass(&row[2], constants->filter, -mul(g, mul(half, c0->lamC + c1->lamC)));
     low_pass(&row[3], constants->filter, mul(g, displaced - flow));
 }
 
 /* The innovation test of the load: too large several times in a row, and the load alone is open again. */
-static void notice_changed_load(struct estimator *e, const struct estimator_constants *constants,
-                                enum joint i, scalar residual, scalar innovation_variance)
+static void notice_changed_load(struct estimator *e, const struct estimator_parameters *parameters,
+                                const struct estimator_constants *constants, enum joint i, scalar residual,
+                                variance innovation)
 {
-    const scalar bound = mul(constants->innovation_limit_squared, innovation_variance);
-    if (square(residual) <= bound) {
+    if (absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
         e->strikes[i] = 0;
         return;
     }
@@ -184,15 +185,29 @@ static void notice_changed_load(struct estimator *e, const struct estimator_cons
 
 /* theta += K residual, then projection onto the bounds, Eq 21: integrate, then clamp. Returns the variance that
  * the residual was expected to have. */
-static scalar update_block(struct ud_factors *covariance, const scalar phi[], scalar residual,
-                         const scalar scale[], const struct prior prior[], scalar theta[])
+static variance update_block(struct ud_factors *covariance, const scalar phi[], variance noise,
+                             scalar residual, const scalar scale[], const struct prior prior[],
+                             scalar theta[])
 {
-    scalar K[UD_SIZE_MAX];
-    const scalar innovation_variance = ud_update(covariance, phi, K);
+    gain K[UD_SIZE_MAX];
+    const variance innovation = ud_update(covariance, phi, noise, K);
     for (uint8_t k = 0; k < covariance->size; k++) {
-        theta[k] = limit(theta[k] + mul(scale[k], mul(K[k], residual)), prior[k].low, prior[k].high);
+        theta[k] = limit(theta[k] + mul(scale[k], amp(K[k], residual)), prior[k].low, prior[k].high);
     }
-    return innovation_variance;
+    return innovation;
+}
+
+/* The load's random walk, up to its bound. */
+static void walk(struct estimator *e, const struct estimator_constants *constants)
+{
+    e->walk_updates++;
+    if (e->walk_updates < WALK_UPDATES) {
+        return;
+    }
+    e->walk_updates = 0;
+    if (ud_variance(&e->covariance_m, M_T) < constants->load_variance) {
+        e->covariance_m.D[M_T] += constants->walk;
+    }
 }
 
 static void update_mechanics(struct estimator *e, const struct estimator_parameters *parameters,
@@ -204,14 +219,12 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
         const uint8_t parameter = row_parameter[i][k];
         const scalar column = e->row_m[i][k].second;
         residual -= mul(column, e->theta_m[parameter]);
-        phi[parameter] = mul(column, constants->phi_m[i][parameter]);
+        phi[parameter] = mul(column, constants->scale_m[parameter]);
     }
-    if (ud_variance(&e->covariance_m, M_T) < constants->load_variance) {
-        e->covariance_m.D[M_T] += constants->walk;
-    }
-    const scalar whitened = mul(residual, constants->residual_m[i]);
-    const scalar variance = update_block(&e->covariance_m, phi, whitened, constants->scale_m, parameters->m, e->theta_m);
-    notice_changed_load(e, constants, i, whitened, variance);
+    walk(e, constants);
+    const variance innovation = update_block(&e->covariance_m, phi, constants->noise_m[i], residual,
+                                             constants->scale_m, parameters->m, e->theta_m);
+    notice_changed_load(e, parameters, constants, i, residual, innovation);
 }
 
 static void update_hydraulics(struct estimator *e, const struct estimator_parameters *parameters,
@@ -223,10 +236,10 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
         const uint8_t parameter = hydraulic_parameter[i][k];
         const scalar column = e->row_h[i][k].second;
         residual -= mul(column, e->theta_h[parameter]);
-        phi[parameter] = mul(column, constants->phi_h[i][parameter]);
+        phi[parameter] = mul(column, constants->scale_h[parameter]);
     }
-    (void)update_block(&e->covariance_h, phi, mul(residual, constants->residual_h[i]), constants->scale_h,
-                 parameters->h, e->theta_h);
+    (void)update_block(&e->covariance_h, phi, constants->noise_h[i], residual, constants->scale_h,
+                       parameters->h, e->theta_h);
 }
 
 /* sat_M: the law's estimate follows by at most `step` a tick. */
@@ -288,11 +301,11 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
 scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,
                       enum theta_m k)
 {
-    return mul(root(ud_variance(&estimator->covariance_m, (uint8_t)k)), constants->scale_m[k]);
+    return mul(sd_of(ud_variance(&estimator->covariance_m, (uint8_t)k)), constants->scale_m[k]);
 }
 
 scalar estimator_sd_h(const struct estimator *estimator, const struct estimator_constants *constants,
                       enum theta_h k)
 {
-    return mul(root(ud_variance(&estimator->covariance_h, (uint8_t)k)), constants->scale_h[k]);
+    return mul(sd_of(ud_variance(&estimator->covariance_h, (uint8_t)k)), constants->scale_h[k]);
 }

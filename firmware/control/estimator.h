@@ -45,26 +45,24 @@ struct estimator_parameters {
     scalar gate_rate;            /* the gate opens from this reference rate on, full at twice it; rad/s */
     scalar torque_noise[JOINTS]; /* sd of a filtered row of the mechanics, N m */
     scalar flow_noise[JOINTS];   /* sd of a filtered row of the hydraulics, m^2/s */
-    scalar flow_error; /* share of the flow that the valve gain may be wrong by */
+    scalar flow_error;           /* share of the flow that the valve gain may be wrong by */
     scalar load_walk;            /* the load's sd grows by this in 1 s of open gate, kg */
     gain rate_limit;             /* of the estimate the law sees, ranges per second */
-    scalar innovation_limit; /* standard deviations from which an innovation counts as too large */
+    scalar innovation_limit;     /* standard deviations from which an innovation counts as too large */
 };
 
 struct estimator_constants {
-    scalar filter;                 /* pole step, dt / (filter_time + dt) */
-    gain per_tick;                 /* 1 / dt */
-    scalar phi_m[JOINTS][THETA_M]; /* regressor scale: prior range over noise */
-    scalar phi_h[JOINTS][THETA_H];
-    scalar residual_m[JOINTS]; /* 1 / noise */
-    scalar residual_h[JOINTS];
+    scalar filter;            /* pole step, dt / (filter_time + dt) */
+    gain filter_rate;         /* pole step / dt, 1/s */
+    gain per_tick;            /* 1 / dt */
+    variance noise_m[JOINTS]; /* of a filtered row */
+    variance noise_h[JOINTS];
     scalar scale_m[THETA_M]; /* high - low */
     scalar scale_h[THETA_H];
     scalar step_m[THETA_M]; /* rate limit per tick */
     scalar step_h[THETA_H];
-    scalar walk;          /* variance the load gains per update, in its scale */
-    scalar load_variance; /* its bound, in its scale */
-    scalar innovation_limit_squared;
+    variance walk;          /* what the load gains every WALK_UPDATES updates, in its scale */
+    variance load_variance; /* its bound, in its scale */
 };
 
 /* What one tick measured and the reference it was measured at. */
@@ -73,15 +71,17 @@ struct estimator_sample {
     scalar reference_w[JOINTS]; /* qd', rad/s */
     struct wrist_trig trig;     /* at the measured q2 */
     struct cylinder_state cylinder[JOINTS];
-    scalar lever[JOINTS];       /* of friction: R over that at q = 0, or 1 */
+    scalar lever[JOINTS]; /* of friction: R over that at q = 0, or 1 */
     scalar force[JOINTS]; /* F */
     scalar flow[JOINTS];  /* QL from the spool, less leakage */
 };
 
 #define HYDRAULIC_COLUMNS 3 /* 1/be, Om2, Om3 */
 
+/* Two equal poles. A difference quotient is never formed: its sum with the first pole is kept as `step`, in units of
+ * dt / pole step, and so stays as small as the steps it is made of. */
 struct two_poles {
-    scalar first, second;
+    scalar step, first, second;
 };
 
 struct estimator {
@@ -98,12 +98,13 @@ struct estimator {
     scalar previous_w[JOINTS]; /* rate of the last half step */
     struct arm_row previous_momentum[JOINTS];
     scalar previous_gate[JOINTS];
-    scalar ramp;                    /* 0..1, brings the gate up smoothly after a start of the filters */
-    uint8_t strikes[JOINTS];        /* innovations in a row that were too large */
-    uint16_t reopened;              /* how often a changed load was noticed; stops at 65535 */
-    uint8_t turn;    /* which row is updated next, 0..3 */
-    uint8_t samples; /* since the restart, up to 2: balances need two */
-    bool updating;   /* an update was made within the last four ticks */
+    scalar ramp;             /* 0..1, brings the gate up smoothly after a start of the filters */
+    uint8_t strikes[JOINTS]; /* innovations in a row that were too large */
+    uint16_t reopened;       /* how often a changed load was noticed; stops at 65535 */
+    uint8_t walk_updates;    /* updates since the load walked last */
+    uint8_t turn;            /* which row is updated next, 0..3 */
+    uint8_t samples;         /* since the restart, up to 2: balances need two */
+    bool updating;           /* an update was made within the last four ticks */
     uint8_t since_update;
 };
 

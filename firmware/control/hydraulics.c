@@ -4,7 +4,7 @@
 
 static scalar cylinder_length(const struct cylinder_constants *constants, scalar cosine_of_triangle)
 {
-    return root(constants->a2_plus_b2 - SCALAR(2) * mul(constants->ab, cosine_of_triangle));
+    return root(constants->a2_plus_b2 - mul(SCALAR(2), mul(constants->ab, cosine_of_triangle)));
 }
 
 struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
@@ -20,7 +20,7 @@ struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
     constants.X_min = shortest - cylinder->end_margin;
     constants.lever_inverse =
         quot(cylinder_length(&constants, cosine(cylinder->q0)), mul(constants.ab, sine(cylinder->q0)));
-    constants.x_max = longest - shortest + SCALAR(2) * cylinder->end_margin;
+    constants.x_max = longest - shortest + mul(SCALAR(2), cylinder->end_margin);
     return constants;
 }
 

@@ -22,7 +22,7 @@ struct cylinder {
     scalar q_min, q_max; /* joint range, rad */
     scalar end_margin;   /* stroke to spare at each end, m on the lever base */
     scalar kv;           /* Q = kv u sqrt(dp), m^3/s/sqrt(Pa), u in -1..1 */
-    scalar overlap;           /* spool travel either side of the middle that passes nothing */
+    scalar overlap;      /* spool travel either side of the middle that passes nothing */
     scalar leakage;      /* c_l, m^3/s/Pa */
 };
 
@@ -36,9 +36,9 @@ struct cylinder_constants {
     scalar area[CHAMBERS]; /* A1, A2 */
     scalar a2_plus_b2;
     scalar ab;
-    scalar X_min; /* length when retracted */
-    scalar x_max; /* stroke */
-    scalar lever_inverse;      /* 1 / R at q = 0 */
+    scalar X_min;         /* length when retracted */
+    scalar x_max;         /* stroke */
+    scalar lever_inverse; /* 1 / R at q = 0 */
 };
 
 /* The cylinder at one joint angle. */

@@ -5,11 +5,11 @@ struct observer_constants observer_constants(gain bandwidth, scalar dt_s)
     /* rho = exp(-x) by the (2,2) Pade approximant, error below 2e-3 for x <= 1: the pole need not be exact */
     const scalar x = amp(bandwidth, dt_s);
     const scalar even = SCALAR(12) + mul(x, x);
-    const scalar rho = quot(even - SCALAR(6) * x, even + SCALAR(6) * x);
+    const scalar rho = quot(even - mul(SCALAR(6), x), even + mul(SCALAR(6), x));
     const scalar rest = SCALAR(1) - rho;
     return (struct observer_constants){
         .correct_error = SCALAR(1) - mul(rho, rho),
-        .correct_rate = quot(mul(rest, rest), dt_s),
+        .correct_rate = gain_quot(mul(rest, rest), dt_s),
     };
 }
 

@@ -18,8 +18,7 @@ bool trajectory_start(struct trajectory *trajectory, scalar target, uint32_t tic
     trajectory->distance = target - trajectory->start;
     trajectory->ticks = ticks;
     trajectory->tick = 0;
-    trajectory->per_tick = quot(SCALAR(1), scalar_from_raw((int32_t)ticks, 0));
-    trajectory->per_second = quot(trajectory->per_tick, dt_s);
+    trajectory->per_second = gain_quot(fraction(1, ticks), dt_s);
     return true;
 }
 
@@ -28,16 +27,16 @@ struct reference trajectory_now(const struct trajectory *trajectory)
     if (!trajectory_moving(trajectory)) {
         return (struct reference){.q = trajectory->start};
     }
-    const scalar tau = mul(scalar_from_raw((int32_t)trajectory->tick, 0), trajectory->per_tick);
-    const scalar tau2 = mul(tau, tau);
-    const scalar tau3 = mul(tau2, tau);
+    const scalar tau = fraction(trajectory->tick, trajectory->ticks);
     const scalar rest = SCALAR(1) - tau;
+    const scalar tau2 = mul(tau, tau);
     const scalar rest2 = mul(rest, rest);
-    /* s, s' = 140 tau^3 (1 - tau)^3, s'' = 420 tau^2 (1 - tau)^2 (1 - 2 tau) */
-    const scalar s =
-        mul(mul(tau3, tau), SCALAR(35) + mul(tau, SCALAR(-84) + mul(tau, SCALAR(70) - mul(SCALAR(20), tau))));
-    const scalar ds = SCALAR(140) * mul(tau3, mul(rest2, rest));
-    const scalar dds = SCALAR(420) * mul(mul(tau2, rest2), SCALAR(1) - SCALAR(2) * tau);
+    /* s = tau^4 (1 + 4 r + 10 r^2 + 20 r^3), r = 1 - tau: the same polynomial without its large coefficients;
+     * s' = 140 tau^3 r^3, s'' = 420 tau^2 r^2 (r - tau) */
+    const scalar s = mul(mul(tau2, tau2),
+                         SCALAR(1) + mul(rest, SCALAR(4) + mul(rest, SCALAR(10) + mul(SCALAR(20), rest))));
+    const scalar ds = amp(GAIN(140), mul(mul(tau2, tau), mul(rest2, rest)));
+    const scalar dds = amp(GAIN(420), mul(mul(tau2, rest2), rest - tau));
     return (struct reference){
         .q = trajectory->start + mul(trajectory->distance, s),
         .w = amp(trajectory->per_second, mul(trajectory->distance, ds)),

@@ -8,7 +8,6 @@
 struct trajectory {
     scalar start;    /* rad */
     scalar distance; /* rad */
-    scalar per_tick; /* 1 / ticks */
     gain per_second; /* 1 / duration, 1/s */
     uint32_t ticks;  /* of the whole move; 0 = at rest */
     uint32_t tick;   /* 0..ticks */

@@ -79,9 +79,34 @@ static void send(struct ecu *ecu, const struct ecu_port *port, struct can_frame_
     }
 }
 
+static void leave_run(struct ecu *ecu, enum ecu_mode mode)
+{
+    ecu->run_requested = false;
+    controller_disarm(&ecu->controller);
+    ecu->mode = mode;
+}
+
+static void send_valves(struct ecu *ecu, const struct ecu_port *port)
+{
+    send(ecu, port, transmit_valves(ecu));
+    ecu->valves_active = ecu->mode == MODE_RUN;
+}
+
+/* One last frame that shuts the valves, when frames are about to stop with the valves open. */
+static void shut_valves(struct ecu *ecu, const struct ecu_port *port)
+{
+    if (ecu->valves_active) {
+        if (ecu->mode == MODE_RUN) {
+            leave_run(ecu, MODE_STANDBY);
+        }
+        send_valves(ecu, port);
+    }
+}
+
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
 {
     if (ecu->restart_requested) {
+        shut_valves(ecu, port);
         restart(ecu);
     }
     if (ecu->boot_up_due) {
@@ -97,13 +122,6 @@ static void refuse(struct ecu *ecu, enum ecu_refusal reason)
 {
     count_u16(&ecu->counters.refused);
     ecu->counters.last_refusal = reason;
-}
-
-static void leave_run(struct ecu *ecu, enum ecu_mode mode)
-{
-    ecu->run_requested = false;
-    controller_disarm(&ecu->controller);
-    ecu->mode = mode;
 }
 
 static void enter_fault(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault fault)
@@ -126,6 +144,7 @@ static void nmt_command(struct ecu *ecu, const struct can_frame_11bit *frame)
     case DIARC_NMT_COMMAND_STOP_CHOICE:
     case DIARC_NMT_COMMAND_ENTER_PREOPERATIONAL_CHOICE:
         ecu->nmt = frame->data[0] == DIARC_NMT_COMMAND_STOP_CHOICE ? NMT_STOPPED : NMT_PRE_OPERATIONAL;
+        ecu->run_requested = false;
         if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
             leave_run(ecu, MODE_STANDBY);
         }
@@ -176,17 +195,19 @@ static enum ecu_refusal request_move(struct ecu *ecu, const struct diarc_motion_
 
 static enum ecu_refusal request_tare(struct ecu *ecu)
 {
-    if (ecu->mode != MODE_STANDBY) {
+    if (ecu->mode != MODE_STANDBY || ecu->run_requested) {
         return REFUSAL_NOT_IN_STANDBY;
     }
-    ecu->tare = (struct tare){0};
+    for (uint8_t n = 0; n < JOINTS * CHAMBERS; n++) {
+        ecu->tare.sum[n / CHAMBERS][n % CHAMBERS] = 0;
+    }
     ecu->tare.samples = (uint16_t)(TARE_US / ecu->period_us);
     ecu->tare.samples_left = ecu->tare.samples;
     ecu->mode = MODE_TARE;
     return REFUSAL_NONE;
 }
 
-static enum ecu_refusal request_fault_reset(struct ecu *ecu)
+static enum ecu_refusal request_fault_reset(struct ecu *ecu, const struct ecu_port *port)
 {
     if (ecu->mode != MODE_FAULT) {
         return REFUSAL_NO_FAULT_TO_RESET;
@@ -196,10 +217,11 @@ static enum ecu_refusal request_fault_reset(struct ecu *ecu)
     }
     ecu->fault = FAULT_NONE;
     ecu->mode = MODE_STANDBY;
+    send(ecu, port, transmit_emergency(ecu, 0));
     return REFUSAL_NONE;
 }
 
-static void motion_request(struct ecu *ecu)
+static void motion_request(struct ecu *ecu, const struct ecu_port *port)
 {
     struct diarc_motion_t motion = {0};
     (void)diarc_motion_unpack(&motion, ecu->receive.row[RX_MOTION].data, DIARC_MOTION_LENGTH);
@@ -211,10 +233,11 @@ static void motion_request(struct ecu *ecu)
     } else if (motion.request == DIARC_MOTION_REQUEST_MOVE_CHOICE) {
         refusal = request_move(ecu, &motion);
     } else if (motion.request == DIARC_MOTION_REQUEST_RESET_FAULT_CHOICE) {
-        refusal = request_fault_reset(ecu);
+        refusal = request_fault_reset(ecu, port);
     } else if (motion.request == DIARC_MOTION_REQUEST_TARE_CHOICE) {
         refusal = request_tare(ecu);
     } else if (motion.request == DIARC_MOTION_REQUEST_STANDBY_CHOICE) {
+        ecu->run_requested = false;
         if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
             leave_run(ecu, MODE_STANDBY);
         }
@@ -238,7 +261,7 @@ bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
         }
         enum received_frame which = RX_FRAMES;
         if (receive_accept(&ecu->receive, &frame, &which) == RECEIVE_GOOD && which == RX_MOTION) {
-            motion_request(ecu);
+            motion_request(ecu, port);
         }
     }
     const bool complete = receive_complete(&ecu->receive);
@@ -385,16 +408,20 @@ static void tare_step(struct ecu *ecu, bool good)
     const int8_t base = ecu->bases.pressure;
     const scalar tank = ecu->machine.supply.p_tank;
     const scalar limit_Pa = WIRE_DECODE(TARE_LIMIT_RAW, DIARC_PRESSURES_SWING_BORE_PRESSURE, base);
+    scalar offset[JOINTS * CHAMBERS];
     for (uint8_t n = 0; n < JOINTS * CHAMBERS; n++) {
         const int32_t sum = tare->sum[n / CHAMBERS][n % CHAMBERS];
         const int32_t mean = sum * (1 << TARE_EXTRA_BITS) / tare->samples;
-        const scalar p = WIRE_DECODE(mean, DIARC_PRESSURES_SWING_BORE_PRESSURE, (int8_t)(base + TARE_EXTRA_BITS));
-        tare->offset[n / CHAMBERS][n % CHAMBERS] = p - tank;
-        if (absolute(p - tank) > limit_Pa) {
-            *tare = (struct tare){0};
-            refuse(ecu, REFUSAL_NOT_DEPRESSURISED);
+        const scalar p =
+            WIRE_DECODE(mean, DIARC_PRESSURES_SWING_BORE_PRESSURE, (int8_t)(base + TARE_EXTRA_BITS));
+        offset[n] = p - tank;
+        if (absolute(offset[n]) > limit_Pa) {
+            refuse(ecu, REFUSAL_NOT_DEPRESSURISED); /* the offsets of the last good tare stay */
             return;
         }
+    }
+    for (uint8_t n = 0; n < JOINTS * CHAMBERS; n++) {
+        tare->offset[n / CHAMBERS][n % CHAMBERS] = offset[n];
     }
 }
 
@@ -437,6 +464,7 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
 {
     if (!receive_complete(&ecu->receive)) {
         count_u16(&ecu->counters.late_ticks);
+        ecu->complete_at_us = port->now_us(port->context);
     }
     receive_end_tick(&ecu->receive);
 
@@ -456,10 +484,12 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
     }
 
     if (ecu->nmt == NMT_OPERATIONAL) {
-        send(ecu, port, transmit_valves(ecu));
+        send_valves(ecu, port);
         const uint32_t tick_time_us = port->now_us(port->context) - ecu->complete_at_us;
         ecu->counters.tick_time_us = tick_time_us < UINT16_MAX ? (uint16_t)tick_time_us : UINT16_MAX;
         send_slow_frames(ecu, port);
+    } else {
+        shut_valves(ecu, port);
     }
     if (ecu->heartbeat_ticks == 0u) {
         send(ecu, port, transmit_heartbeat((uint8_t)ecu->nmt));
@@ -475,5 +505,5 @@ void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port)
     if (ecu->mode == MODE_RUN) {
         leave_run(ecu, MODE_STANDBY);
     }
-    send(ecu, port, transmit_valves(ecu));
+    send_valves(ecu, port);
 }

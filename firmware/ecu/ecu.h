@@ -56,8 +56,8 @@ struct sensor_samples {
 struct tare {
     uint16_t samples_left;
     uint16_t samples;
-    int32_t sum[JOINTS][CHAMBERS];    /* raw */
-    scalar offset[JOINTS][CHAMBERS];  /* Pa */
+    int32_t sum[JOINTS][CHAMBERS];   /* raw */
+    scalar offset[JOINTS][CHAMBERS]; /* Pa */
 };
 
 struct ecu_counters {
@@ -89,6 +89,7 @@ struct ecu {
     bool restart_requested; /* by NMT */
     bool boot_up_due;
     bool run_requested;
+    bool valves_active; /* the last valve frame opened them */
     enum controller_kind run_controller;
     uint8_t sync_counter; /* 1..240 */
     uint8_t phase;        /* tick modulo the slow frames' cycle */

@@ -25,6 +25,10 @@ const char *ecu_status_text(enum ecu_status status)
         return "has per-unit bases outside their ranges (can_protocol/parameters.toml)";
     case ECU_PARAMETER_RANGE:
         return "has a parameter outside its range (can_protocol/parameters.toml)";
+    case ECU_PARAMETER_RELATION:
+        return "has a parameter that contradicts another: ends of a range swapped, rod thicker than bore, a "
+               "prior "
+               "outside its bounds, or a crank at its dead point";
     case ECU_PERIOD_RANGE:
         return "the period must be 250..20000 us and below 1 / control.observer_rad_s";
     default:

@@ -69,6 +69,96 @@ static int8_t base_of(const struct parameter_entry *entry, const struct bases *b
                     entry->exponents[2] * bases->lever);
 }
 
+/* Pairs of parameters of which the first must be below the second; for a prior's value equal will do. */
+struct parameter_relation {
+    size_t lower, higher;
+    bool may_be_equal;
+};
+
+#define FIELD(name) offsetof(struct machine, name)
+#define BELOW(a, b)               \
+    {                             \
+        FIELD(a), FIELD(b), false \
+    }
+#define PRIOR(name)                                                         \
+    BELOW(name.low, name.high), {FIELD(name.low), FIELD(name.value), true}, \
+    {                                                                       \
+        FIELD(name.value), FIELD(name.high), true                           \
+    }
+
+static const struct parameter_relation RELATIONS[] = {
+    BELOW(supply.p_tank, supply.p_supply),
+    BELOW(cylinder[SWING].rod, cylinder[SWING].bore),
+    BELOW(cylinder[WRIST].rod, cylinder[WRIST].bore),
+    BELOW(cylinder[SWING].q_min, cylinder[SWING].q_max),
+    BELOW(cylinder[WRIST].q_min, cylinder[WRIST].q_max),
+    PRIOR(estimator.m[M_T]),
+    PRIOR(estimator.m[J]),
+    PRIOR(estimator.m[M2]),
+    PRIOR(estimator.m[FV1]),
+    PRIOR(estimator.m[FV2]),
+    PRIOR(estimator.m[FC1]),
+    PRIOR(estimator.m[FC2]),
+    PRIOR(estimator.m[OM1]),
+    PRIOR(estimator.m[OM2]),
+    PRIOR(estimator.h[BETA_INVERSE]),
+    PRIOR(estimator.h[OM2_SWING]),
+    PRIOR(estimator.h[OM3_SWING]),
+    PRIOR(estimator.h[OM2_WRIST]),
+    PRIOR(estimator.h[OM3_WRIST]),
+};
+
+/* The crank's triangle stays this far from its dead points, rad. */
+#define TRIANGLE_LOW SCALAR(0.05)
+#define TRIANGLE_HIGH SCALAR(3.09)
+
+static uint32_t image_bits(const struct parameter_image *image, uint16_t entry)
+{
+    return read_u32(&image->bytes[HEADER_BYTES + 4u * entry]);
+}
+
+/* The entry that fills a field; every field has one. */
+static uint16_t entry_of(size_t offset)
+{
+    uint16_t k = 0;
+    while (k < PARAMETER_COUNT - 1 && TABLE[k].offset != offset) {
+        k++;
+    }
+    return k;
+}
+
+static scalar angle_of(const struct parameter_image *image, size_t offset)
+{
+    return scalar_from_real32(image_bits(image, entry_of(offset)), 0);
+}
+
+/* False, and *entry the offender, when two parameters contradict one another. */
+static bool relations_hold(const struct parameter_image *image, uint16_t *entry)
+{
+    for (uint8_t n = 0; n < sizeof RELATIONS / sizeof RELATIONS[0]; n++) {
+        const uint16_t lower = entry_of(RELATIONS[n].lower);
+        const int32_t low = real32_order(image_bits(image, lower));
+        const int32_t high = real32_order(image_bits(image, entry_of(RELATIONS[n].higher)));
+        if (low > high || (low == high && !RELATIONS[n].may_be_equal)) {
+            *entry = lower;
+            return false;
+        }
+    }
+    static const size_t ends[JOINTS][3] = {
+        {FIELD(cylinder[SWING].q0), FIELD(cylinder[SWING].q_min), FIELD(cylinder[SWING].q_max)},
+        {FIELD(cylinder[WRIST].q0), FIELD(cylinder[WRIST].q_min), FIELD(cylinder[WRIST].q_max)},
+    };
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        const scalar q0 = angle_of(image, ends[i][0]);
+        if (angle_of(image, ends[i][1]) + q0 < TRIANGLE_LOW ||
+            angle_of(image, ends[i][2]) + q0 > TRIANGLE_HIGH) {
+            *entry = entry_of(ends[i][0]);
+            return false;
+        }
+    }
+    return true;
+}
+
 enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
                                 const struct parameter_image *image, uint16_t *entry)
 {
@@ -89,16 +179,19 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
         return ECU_IMAGE_BASES;
     }
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
-        const uint32_t bits = read_u32(&bytes[HEADER_BYTES + 4u * k]);
+        const uint32_t bits = image_bits(image, k);
         if (!real32_is_number(bits) || real32_order(bits) < real32_order(TABLE[k].low) ||
             real32_order(bits) > real32_order(TABLE[k].high)) {
             *entry = k;
             return ECU_PARAMETER_RANGE;
         }
     }
+    if (!relations_hold(image, entry)) {
+        return ECU_PARAMETER_RELATION;
+    }
     *bases = found;
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
-        const uint32_t bits = read_u32(&bytes[HEADER_BYTES + 4u * k]);
+        const uint32_t bits = image_bits(image, k);
         const int8_t exponent = base_of(&TABLE[k], &found);
         uint8_t *const field = (uint8_t *)machine + TABLE[k].offset;
         if (TABLE[k].kind == PARAMETER_GAIN) {

@@ -29,6 +29,7 @@ enum ecu_status {
     ECU_IMAGE_DAMAGED,      /* CRC */
     ECU_IMAGE_BASES,        /* a base exponent outside its range, or odd where it must be even */
     ECU_PARAMETER_RANGE,    /* a number outside its range, or no number */
+    ECU_PARAMETER_RELATION, /* it contradicts another: ends of a range swapped, rod thicker than bore, .. */
     ECU_PERIOD_RANGE        /* period outside 250..20000 us, or too long for the observer's bandwidth */
 };
 
@@ -36,7 +37,7 @@ enum ecu_status {
 extern const struct parameter_image default_parameter_image;
 
 /* Check the image and fill machine and bases; on any error both are left as they were. *entry is the number
- * of the offending parameter with ECU_PARAMETER_RANGE. */
+ * of the offending parameter with ECU_PARAMETER_RANGE and ECU_PARAMETER_RELATION. */
 enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
                                 const struct parameter_image *image, uint16_t *entry);
 

@@ -100,11 +100,11 @@ static int run(const struct options *options, const char *program)
     const struct parameter_image *const image = options->params_path != NULL ? &the_image : NULL;
     uint16_t entry = 0;
     const enum ecu_status status = ecu_init(&the_ecu, image, options->period_us, &entry);
+    const bool names_parameter = status == ECU_PARAMETER_RANGE || status == ECU_PARAMETER_RELATION;
     if (status != ECU_OK) {
         (void)fprintf(stderr, "diarc_ecu: %s%s%s%s%s\n", image != NULL ? options->params_path : "",
-                      image != NULL ? ": " : "", ecu_status_text(status),
-                      status == ECU_PARAMETER_RANGE ? ": " : "",
-                      status == ECU_PARAMETER_RANGE ? parameter_name(entry) : "");
+                      image != NULL ? ": " : "", ecu_status_text(status), names_parameter ? ": " : "",
+                      names_parameter ? parameter_name(entry) : "");
         return EXIT_WRONG_USE;
     }
     struct bus *const bus = open_bus(options);

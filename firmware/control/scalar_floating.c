@@ -1,11 +1,12 @@
 #include "control/scalar.h"
 
+#if !defined(DIARC_SCALAR_FIXED)
+
 #define PI SCALAR(3.14159265358979323846)
 #define HALF_PI SCALAR(1.57079632679489661923)
 #define QUARTER_PI SCALAR(0.78539816339744830962)
 #define TWO_PI SCALAR(6.28318530717958647692)
 #define TAN_PI_8 SCALAR(0.41421356237309504880)
-#define TAN_3PI_8 SCALAR(2.41421356237309504880)
 
 /* Odd polynomials x * P(x^2) through the Chebyshev nodes of [0, (pi/2)^2] and [0, tan(pi/8)^2]; truncation
  * error 1.8e-16 and 3.5e-16 (double), 6.7e-9 and 6.8e-9 (float). */
@@ -62,21 +63,23 @@ scalar cosine(scalar x)
     return sine(x < SCALAR(0) ? HALF_PI + x : HALF_PI - x);
 }
 
-scalar arctangent(scalar x)
+scalar arctangent(scalar y, scalar x)
 {
-    const scalar a = absolute(x);
+    const scalar a = absolute(y);
     scalar offset = SCALAR(0);
-    scalar y = a;
-    if (a > TAN_3PI_8) {
+    scalar ratio;
+    if (mul(a, TAN_PI_8) > x) {
         offset = HALF_PI;
-        y = -quot(SCALAR(1), a);
-    } else if (a > TAN_PI_8) {
+        ratio = -quot(x, a);
+    } else if (a > mul(x, TAN_PI_8)) {
         offset = QUARTER_PI;
-        y = quot(a - SCALAR(1), a + SCALAR(1));
+        ratio = quot(a - x, a + x);
+    } else {
+        ratio = quot(a, x);
     }
     const scalar angle =
-        offset + odd_polynomial(ARCTANGENT, (uint8_t)(sizeof ARCTANGENT / sizeof ARCTANGENT[0]), y);
-    return x < SCALAR(0) ? -angle : angle;
+        offset + odd_polynomial(ARCTANGENT, (uint8_t)(sizeof ARCTANGENT / sizeof ARCTANGENT[0]), ratio);
+    return y < SCALAR(0) ? -angle : angle;
 }
 
 /* 2^exponent, by repeated exact doubling or halving. */
@@ -124,3 +127,5 @@ gain gain_from_real32(uint32_t bits, int8_t exponent)
 {
     return scalar_from_real32(bits, exponent);
 }
+
+#endif
