@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import NoReturn
 
 ROOT = Path(__file__).resolve().parents[1]
 NEEDED = ("numpy", "numba", "can", "cantools", "rich")
@@ -44,3 +46,12 @@ def show(text: str) -> None:
         print(text, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class CommandLine(argparse.ArgumentParser):
+    """A parser whose errors are one line that says what to do next."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong with the command line and exit with status 2."""
+        say(f"{self.prog}: {message}; see {self.prog} --help")
+        sys.exit(2)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sil_plant import bus_run, inproc, session
-from sil_plant.buses import BusAddress, HubPort, open_frame_port
+from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.environment import say
 from sil_plant.machine import Machine
@@ -138,7 +138,11 @@ def over_bus(
         stack.callback(bus_run.leave_ecu_safe, port)
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
-        bus_run.run_on_bus(run, port, progress, alive)
+        try:
+            bus_run.run_on_bus(run, port, progress, alive)
+        except BusError as error:
+            bus_run.close_valves(run)
+            raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
         return time.perf_counter() - start
 
 

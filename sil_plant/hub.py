@@ -594,7 +594,7 @@ def _listen(host: str, port: int, allow_remote: bool) -> socket.socket:
     if not allow_remote and not ipaddress.ip_address(address[0]).is_loopback:
         raise BusError(
             f"refused to listen on {where}: other computers could move the arm (CAN has no authentication); "
-            f"use --bus tcp:127.0.0.1:{port}, or pass allow_remote=True on a network you trust"
+            f"use --bus tcp:127.0.0.1:{port}"
         )
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:

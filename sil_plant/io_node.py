@@ -222,8 +222,6 @@ def node_sync(
     count = node.count
     if count[SYNC_LAST] > 0:
         periods = (sync_counter - count[SYNC_LAST]) % 240
-        if periods == 0:
-            periods = 240
         count[SYNC_LOST] += periods - 1
         for _ in range(periods):
             if not parked:
@@ -278,5 +276,7 @@ def node_frame(node: Node, layout: NodeLayout, row: np.ndarray) -> None:
     for i in range(2):
         enabled = get(row, fields[2 + i, 0], fields[2 + i, 1], 0) == 7
         raw = get(row, fields[i, 0], fields[i, 1], 1)
+        if raw < -_SPOOL_LIMIT:  # marked invalid
+            enabled = False
         node.u[1, i] = min(max(raw * layout.command_step, -1.0), 1.0) if enabled else 0.0
     count[COMMAND_NEW] = 1

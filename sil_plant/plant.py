@@ -30,9 +30,10 @@ LONGEST_STEP_S = 2.5e-4
 
 # Below this pressure drop the root's slope is held finite (an odd cubic that meets the root with its slope).
 _ROOT_BLEND_PA = 1e4
-# Contact of the piston with the cylinder's ends.
-_END_STIFFNESS_N_M = 2e7
-_END_DAMPING_NS_M = 2e4
+# The joints' stops: this far outside the joint range, as stiff as these are at the cylinder with the arm at q = 0.
+STOP_BEYOND_RAD = 0.02
+_STOP_STIFFNESS_N_M = 2e7
+_STOP_DAMPING_NS_M = 2e4
 
 
 class PlantParameters(NamedTuple):
@@ -65,6 +66,8 @@ class PlantParameters(NamedTuple):
     overlap: np.ndarray
     friction_at_cylinder: float
     lever_inverse: np.ndarray
+    q_low: np.ndarray
+    q_high: np.ndarray
     stribeck: float
     stribeck_rate: float
     air_bulk_low: float
@@ -115,6 +118,8 @@ def plant_parameters(machine: Machine) -> PlantParameters:
         overlap=pair("*.valve_overlap"),
         friction_at_cylinder=machine["arm.friction_at_cylinder"],
         lever_inverse=length(np.zeros(2)) / (a * b * np.sin(q0)),
+        q_low=pair("*.q_min_rad") - STOP_BEYOND_RAD,
+        q_high=pair("*.q_max_rad") + STOP_BEYOND_RAD,
         stribeck=machine["effects.stribeck"],
         stribeck_rate=machine["effects.stribeck_rate_rad_s"],
         air_bulk_low=machine["effects.air_bulk_low_Pa"],
@@ -135,12 +140,14 @@ def signed_root(x: float) -> float:
 
 
 @njit(cache=True, inline="always")
-def end_contact(x: float, x_rate: float, stroke: float) -> float:
-    """Force on the piston from the cylinder's ends, N, positive for extension."""
-    if x < 0.0:
-        return max(-_END_STIFFNESS_N_M * x - _END_DAMPING_NS_M * x_rate, 0.0)
-    if x > stroke:
-        return min(-_END_STIFFNESS_N_M * (x - stroke) - _END_DAMPING_NS_M * x_rate, 0.0)
+def stop_torque(q: float, w: float, i: int, p: PlantParameters) -> float:
+    """Torque of the stops of joint ``i``, N m; they push, they never hold."""
+    lever_squared = 1.0 / (p.lever_inverse[i] * p.lever_inverse[i])
+    stiffness, damping = _STOP_STIFFNESS_N_M * lever_squared, _STOP_DAMPING_NS_M * lever_squared
+    if q < p.q_low[i]:
+        return max(stiffness * (p.q_low[i] - q) - damping * w, 0.0)
+    if q > p.q_high[i]:
+        return min(stiffness * (p.q_high[i] - q) - damping * w, 0.0)
     return 0.0
 
 
@@ -210,12 +217,12 @@ def derivative(y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters,
         dy[P_SWING + 2 * i + 1] = bulk_modulus(p2, p) / volume2 * (p.area2[i] * x_rate - flow2 + leak)
         dy[XV + i] = xv_rate
         dy[XV_RATE + i] = p.valve_w[i] * p.valve_w[i] * (u[i] - xv) - 2.0 * p.valve_damping[i] * p.valve_w[i] * xv_rate
-        force = p1 * p.area1[i] - p2 * p.area2[i] + end_contact(x, x_rate, p.stroke[i])
+        force = p1 * p.area1[i] - p2 * p.area2[i]
         friction = friction_torque(w, lever, i, p)
         if i == 0:
-            torque_1 = lever * force - friction
+            torque_1 = lever * force - friction + stop_torque(y[Q], w, i, p)
         else:
-            torque_2 = lever * force - friction
+            torque_2 = lever * force - friction + stop_torque(y[Q + 1], w, i, p)
     s, c = math.sin(q2), math.cos(q2)
     r = p.L1 + p.L2 * c
     h11 = p.I1 + p.m2 * p.L1 * r + p.J * c * c + load_kg * r * r

@@ -141,6 +141,25 @@ def table(result: Result, bus_load: float) -> str:
     )
 
 
+def check_writable(path: Path) -> None:
+    """Make sure, before a run, that its results can be written.
+
+    Raises
+    ------
+    ConfigError
+        Saying why not.
+    """
+    if not path.resolve().parent.is_dir():
+        raise ConfigError(f"{path}: its folder does not exist")
+    there = path.exists()
+    try:
+        path.open("a").close()
+        if not there:
+            path.unlink()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another file or folder") from error
+
+
 def write_json(path: Path, result: Result) -> None:
     """Write the figures.
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import enter, say, show  # noqa: E402
+from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -50,9 +50,7 @@ EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
     """Read the command line; a wrong one ends the program with status 2."""
-    parser = argparse.ArgumentParser(
-        prog="run.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandLine(prog="run.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--load", type=float, metavar="KG", help="load at the tip; default: the scenario's")
     parser.add_argument("--bus", default="vcan0", metavar="BUS", help="vcan0 (default), can0, tcp:HOST:PORT, inproc")
     parser.add_argument(
@@ -112,28 +110,35 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
             raise ConfigError(f"--duration {arguments.duration:g}: 0.01 to {LONGEST_RUN_S:g} s is possible")
         scenario = replace(scenario, duration_s=arguments.duration)
     if arguments.seed is not None:
-        if arguments.seed < 0:
-            raise ConfigError(f"--seed {arguments.seed}: a whole number from 0 is needed")
+        if not 0 <= arguments.seed < 2**63:
+            raise ConfigError(f"--seed {arguments.seed}: a whole number from 0 to 2^63 - 1 is needed")
         scenario = replace(scenario, seed=arguments.seed)
     check_scenario(scenario, machine)
     plant_machine = with_changes(machine, profile.effects, f"profile {profile.name}: [effects]")
     plant_machine = with_changes(plant_machine, scenario.plant, f"{arguments.scenario}: [plant]")
     for path in (arguments.json, arguments.csv):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise ConfigError(f"{path}: its folder does not exist")
+        if path is not None:
+            results.check_writable(path)
     return Inputs(machine, plant_machine, scenario, profile.tare, address)
 
 
-def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run) -> results.Result:
-    """Write what was recorded and print the table."""
+def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run) -> bool:
+    """Print the table and write what was recorded; one file that fails does not cost the others."""
     result = results.summarise(record, run)
-    if arguments.json:
-        results.write_json(arguments.json, result)
-    if arguments.csv:
-        results.write_csv(arguments.csv, record, run)
     if not arguments.quiet:
         show(results.table(result, protocol.worst_case_bus_load()))
-    return result
+    written = True
+    for path, write in (
+        (arguments.json, lambda path: results.write_json(path, result)),
+        (arguments.csv, lambda path: results.write_csv(path, record, run)),
+    ):
+        try:
+            if path is not None:
+                write(path)
+        except ConfigError as error:
+            say(f"run.py: {error}")
+            written = False
+    return written
 
 
 def main(argv: list[str]) -> int:
@@ -203,10 +208,7 @@ def main(argv: list[str]) -> int:
             wall_s=time.perf_counter() - start if wall_s is None else wall_s,
             load_est_kg=float(run.monitor.load[0]),
         )
-        try:
-            write_outputs(arguments, run.record, figures)
-        except ConfigError as error:
-            say(f"run.py: {error}")
+        if not write_outputs(arguments, run.record, figures):
             status = status or EXIT_WRONG_USE
     if problem:
         say(f"run.py: {problem}")

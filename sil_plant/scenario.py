@@ -60,6 +60,8 @@ class Scenario:
         Dotted keys of the machine file, and the plant's values in their place.
     faults : tuple
         Kept for a later version.
+    source : TomlFile or None
+        Where it was read from, for messages.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Scenario:
     load: tuple[LoadStep, ...]
     plant: dict[str, float] = field(default_factory=dict)
     faults: tuple[dict[str, Any], ...] = ()
+    source: TomlFile | None = None
 
 
 TOP_KEYS = {"name", "duration_s", "seed", "start_pose_rad", "repeat", "load", "plant", "faults", *JOINT_NAMES}
@@ -123,6 +126,7 @@ def load_scenario(path: Path) -> Scenario:
         load=_load_steps(toml),
         plant={key: toml.number(f"plant.{key}", value, -1e12, 1e12) for key, value in flatten(plant)},
         faults=tuple(faults),
+        source=toml,
     )
 
 
@@ -132,21 +136,21 @@ def _segments(toml: TomlFile, joint: str) -> tuple[Segment, ...]:
     if not isinstance(items, list) or (isinstance(table, dict) and set(table) - {"segment"}):
         raise toml.error(joint, f"a list of tables [[{joint}.segment]] is needed, and nothing else")
     segments = []
-    for item in items:
+    for n, item in enumerate(items):
         key = f"{joint}.segment"
         if not isinstance(item, dict):
-            raise toml.error(key, "a table with target_rad, duration_s and dwell_s is needed")
+            raise toml.error(key, "a table with target_rad, duration_s and dwell_s is needed", n)
         for name in item:
             if name not in SEGMENT_KEYS:
-                raise toml.error(f"{key}.{name}", f"is not a key of a segment; known are {sorted(SEGMENT_KEYS)}")
+                raise toml.error(f"{key}.{name}", f"is not a key of a segment; known are {sorted(SEGMENT_KEYS)}", n)
         for name in ("target_rad", "duration_s"):
             if name not in item:
-                raise toml.error(key, f"{name} is missing")
+                raise toml.error(key, f"{name} is missing", n)
         segments.append(
             Segment(
-                target_rad=toml.number(f"{key}.target_rad", item["target_rad"], -3.14, 3.14),
-                duration_s=toml.number(f"{key}.duration_s", item["duration_s"], SHORTEST_MOVE_S, LONGEST_MOVE_S),
-                dwell_s=toml.number(f"{key}.dwell_s", item.get("dwell_s", 0.0), 0.0, LONGEST_RUN_S),
+                target_rad=toml.number(f"{key}.target_rad", item["target_rad"], -3.14, 3.14, n),
+                duration_s=toml.number(f"{key}.duration_s", item["duration_s"], SHORTEST_MOVE_S, LONGEST_MOVE_S, n),
+                dwell_s=toml.number(f"{key}.dwell_s", item.get("dwell_s", 0.0), 0.0, LONGEST_RUN_S, n),
             )
         )
     return tuple(segments)
@@ -157,13 +161,13 @@ def _load_steps(toml: TomlFile) -> tuple[LoadStep, ...]:
     if not isinstance(items, list) or not items:
         raise toml.error("load", "a list of tables [[load]] with time_s and load_kg is needed")
     steps = []
-    for item in items:
+    for n, item in enumerate(items):
         if not isinstance(item, dict) or set(item) != {"time_s", "load_kg"}:
-            raise toml.error("load", "each step needs time_s and load_kg, and nothing else")
+            raise toml.error("load", "each step needs time_s and load_kg, and nothing else", n)
         steps.append(
             LoadStep(
-                toml.number("load.time_s", item["time_s"], 0.0, LONGEST_RUN_S),
-                toml.number("load.load_kg", item["load_kg"], 0.0, HEAVIEST_KG),
+                toml.number("load.time_s", item["time_s"], 0.0, LONGEST_RUN_S, n),
+                toml.number("load.load_kg", item["load_kg"], 0.0, HEAVIEST_KG, n),
             )
         )
     if steps[0].time_s != 0.0 or any(a.time_s >= b.time_s for a, b in itertools.pairwise(steps)):
@@ -186,10 +190,12 @@ def check_scenario(scenario: Scenario, machine: Machine) -> None:
     """
     for joint, name in enumerate(JOINT_NAMES):
         low, high = machine[f"{name}.q_min_rad"], machine[f"{name}.q_max_rad"]
-        poses = [scenario.start_pose_rad[joint], *(s.target_rad for s in scenario.segments[joint])]
-        for pose in poses:
+        poses = [("start_pose_rad", 0, scenario.start_pose_rad[joint])]
+        poses += [(f"{name}.segment.target_rad", n, s.target_rad) for n, s in enumerate(scenario.segments[joint])]
+        for key, item, pose in poses:
             if not low <= pose <= high:
-                raise ConfigError(f"{name}: {pose:g} rad is outside the joint's range {low:g} to {high:g} rad")
+                what = f"{pose:g} rad is outside the range of the {name}, {low:g} to {high:g} rad"
+                raise scenario.source.error(key, what, item) if scenario.source else ConfigError(what)
     highest = machine["estimator.prior.m_t_kg.high"]
     for step in scenario.load:
         if not 0.0 <= step.load_kg <= highest:

@@ -16,6 +16,7 @@ from sil_plant import protocol
 from sil_plant.frames import DATA, FRAME_BYTES, frame_id, get, intact, protect, put, quantise, to_row
 from sil_plant.io_node import (
     SENSOR_FRAMES,
+    SYNC_LAST,
     SYNC_LOST,
     Node,
     NodeErrors,
@@ -411,7 +412,7 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     -------
     int
         Rows of ``out`` to send in this order: the master's commands of this tick, then the sensor frames.
-        -1 when the run is over: nothing was done.
+        -1 when the run is over: nothing was done. 0 for a SYNC that came twice.
     """
     index = session.progress.index
     tick = index[TICK]
@@ -421,6 +422,8 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     if index[NEXT_LOAD] < schedule.load_tick.size and schedule.load_tick[index[NEXT_LOAD]] <= tick:
         node.load[0] = schedule.load_kg[index[NEXT_LOAD]]
         index[NEXT_LOAD] += 1
+    if sync_counter == node.count[SYNC_LAST]:
+        return 0  # the same SYNC again: answered already
     rows = 0
     while (
         index[NEXT_FRAME] < schedule.frame_tick.size

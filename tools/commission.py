@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import enter, say, show  # noqa: E402
+from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -35,7 +35,7 @@ EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
     """Read the command line; a wrong one ends the program with status 2."""
-    parser = argparse.ArgumentParser(
+    parser = CommandLine(
         prog="commission.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")

@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import enter, say, show  # noqa: E402
+from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -91,9 +91,7 @@ def tune(machine: Machine, scenario: Scenario, loads: list[float]) -> tuple[list
 
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="tune_pid.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandLine(prog="tune_pid.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", type=Path, default=REFERENCE_ARM, metavar="FILE", help="machine file")
     parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, metavar="FILE", help="benchmark move")
     parser.add_argument("--full-load", type=float, default=10.0, metavar="KG", help="the heaviest load; default 10")

@@ -351,9 +351,6 @@ def test_interface_that_goes_down_does_not_hang_or_lose_the_run(tour: Tour, brok
     assert len(rows) == ticks + 1 > 400 and rows[-1].endswith(",RUN")
 
 
-@pytest.mark.xfail(
-    strict=True, reason="a bus that breaks in a run ends it with 2, wrong use, and leaves the valves open"
-)
 def test_interface_that_goes_down_is_not_taken_for_wrong_use(broken: dict[str, Any]) -> None:
     """GIVEN a run under way WHEN vcan0 goes down
     THEN status 1, as with an ECU that dies, and the valves are closed.

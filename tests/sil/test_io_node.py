@@ -149,7 +149,6 @@ def test_set_point_does_not_exceed_the_spool(rig: Rig, raw: int, u: float) -> No
     assert rig.node.u[0, 0] == u
 
 
-@pytest.mark.xfail(strict=True, reason="the node drives an invalid set-point (8000h) at -100 %; see the DBC's comment")
 def test_invalid_set_point_does_not_open_the_valve(rig: Rig) -> None:
     """GIVEN the spool value that means invalid WHEN sent with a good CRC THEN the valve stays shut."""
     rig.send(rig.command(1, -32768, 0))

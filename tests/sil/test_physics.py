@@ -181,6 +181,8 @@ def random_arm(rng: np.random.Generator, reference: PlantParameters) -> tuple[Ra
     parameters = reference._replace(
         **{name: getattr(arm, name) for name in ("g", "I1", "L1", "L2", "m2", "J", "q0")},
         coulomb_slope=slope,
+        q_low=np.full(2, -9.0),  # no stops: every pose is tried
+        q_high=np.full(2, 9.0),
         fv=fv,
         fc=fc,
         area1=area1,
@@ -274,7 +276,7 @@ class Cylinder:
         self.power_in = p_supply * supplied - p_tank * returned
         self.valve_loss = drop_in * supplied + drop_out * returned
         self.leakage_loss = leak * (p1 - p2)
-        coulomb = 2.0 / np.pi * np.arctan(machine["arm.coulomb_slope_s_rad"] * w)
+        coulomb = 2.0 / np.pi * np.arctan(1.0 / machine["arm.coulomb_rate_rad_s"] * w)
         self.friction_loss = (number("viscous_Nms_rad") * w + number("coulomb_Nm") * coulomb) * w
 
 
