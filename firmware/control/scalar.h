@@ -49,6 +49,9 @@ static inline scalar limit(scalar x, scalar low, scalar high)
     return x > high ? high : x;
 }
 
+/* The number type's own sine, |x| <= pi/2. */
+scalar sine_quarter(scalar x);
+
 /* Sine and cosine of an angle in rad, |x| <= 2 pi. Error at most 5e-16 (double), 2.8e-7 (float, 1.6e-7 within
  * pi and fixed). */
 scalar sine(scalar x);

@@ -2,10 +2,8 @@
 
 #if defined(DIARC_SCALAR_FIXED)
 
-#define PI SCALAR(3.14159265358979323846)
 #define HALF_PI SCALAR(1.57079632679489661923)
 #define QUARTER_PI SCALAR(0.78539816339744830962)
-#define TWO_PI SCALAR(6.28318530717958647692)
 #define TAN_PI_8 SCALAR(0.41421356237309504880)
 
 /* Scaling: coefficients have 30 fraction bits, arguments 29; |y| < 2.5 for sine, so partial sums stay below 1.2. */
@@ -35,24 +33,9 @@ static scalar odd_polynomial(const int32_t *coefficient, int32_t x)
     return fixed_product(p, x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
 }
 
-scalar sine(scalar x)
+scalar sine_quarter(scalar x)
 {
-    if (x > PI) {
-        x = x - TWO_PI;
-    } else if (x < -PI) {
-        x = x + TWO_PI;
-    }
-    if (x > HALF_PI) {
-        x = PI - x;
-    } else if (x < -HALF_PI) {
-        x = -PI - x;
-    }
     return odd_polynomial(SINE, x * (1 << (ARGUMENT_FRACTION - SCALAR_FRACTION)));
-}
-
-scalar cosine(scalar x)
-{
-    return sine(x < SCALAR(0) ? HALF_PI + x : HALF_PI - x);
 }
 
 scalar arctangent(scalar y, scalar x)

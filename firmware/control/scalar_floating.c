@@ -2,10 +2,8 @@
 
 #if !defined(DIARC_SCALAR_FIXED)
 
-#define PI SCALAR(3.14159265358979323846)
 #define HALF_PI SCALAR(1.57079632679489661923)
 #define QUARTER_PI SCALAR(0.78539816339744830962)
-#define TWO_PI SCALAR(6.28318530717958647692)
 #define TAN_PI_8 SCALAR(0.41421356237309504880)
 
 /* Odd polynomials x * P(x^2) through the Chebyshev nodes of [0, (pi/2)^2] and [0, tan(pi/8)^2]; truncation
@@ -43,24 +41,9 @@ static scalar odd_polynomial(const scalar *coefficient, uint8_t terms, scalar x)
     return mul(p, x);
 }
 
-scalar sine(scalar x)
+scalar sine_quarter(scalar x)
 {
-    if (x > PI) {
-        x = x - TWO_PI;
-    } else if (x < -PI) {
-        x = x + TWO_PI;
-    }
-    if (x > HALF_PI) {
-        x = PI - x;
-    } else if (x < -HALF_PI) {
-        x = -PI - x;
-    }
     return odd_polynomial(SINE, (uint8_t)(sizeof SINE / sizeof SINE[0]), x);
-}
-
-scalar cosine(scalar x)
-{
-    return sine(x < SCALAR(0) ? HALF_PI + x : HALF_PI - x);
 }
 
 scalar arctangent(scalar y, scalar x)
