@@ -2,10 +2,12 @@
 PYTHON := .venv/bin/python
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 MAKEFLAGS += --no-print-directory
+# compiles the plant when its sources have changed, so that no test waits for it
+COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
 C_FILES = find firmware tests/unit -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware demo test lint format generate clean
+.PHONY: help setup firmware images demo paper test lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -19,15 +21,26 @@ firmware: ## build the Linux ECU, firmware/diarc_ecu, and the libraries for Pyth
 	@cmake --preset default
 	@cmake --build build --parallel $(JOBS)
 
+images: ## the Cortex-M images, build/cortex-m4f/diarc_ecu.elf and build/cortex-m3/diarc_ecu.elf
+	@for preset in cortex-m4f cortex-m3; do \
+	    cmake --preset $$preset && cmake --build --preset $$preset --parallel $(JOBS) && \
+	    arm-none-eabi-size build/$$preset/diarc_ecu.elf || exit 1; done
+
 demo: ## the ECU moves a simulated arm; needs no CAN hardware
 	@tools/setup.sh demo
 	@$(MAKE) firmware
 	@$(PYTHON) tools/demo.py
 
+paper: ## the paper's figures and tables beside ours: out/paper/report.html
+	@tools/setup.sh demo
+	@$(MAKE) firmware
+	@$(PYTHON) tools/paper.py
+
 test: ## every test: unit tests in C, then pytest
 	@tools/setup.sh test
 	@cmake --preset test
 	@cmake --build build --parallel $(JOBS)
+	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
 	@$(PYTHON) -m pytest
 
