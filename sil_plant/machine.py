@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import struct
 import zlib
@@ -104,6 +105,7 @@ class Machine:
         return self.values[key.replace("*", "swing")], self.values[key.replace("*", "wrist")]
 
 
+@functools.cache
 def load_parameter_table(path: Path = PARAMETERS) -> ParameterTable:
     """Read ``parameters.toml`` and expand its joints and priors."""
     tree = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -176,7 +176,9 @@ void controller_step(struct controller *controller, const struct machine *machin
             out->u = diarc_joint(controller, machine, constants, measured, &sample, (enum joint)i, theta,
                                  &desired, out);
         }
-        out->u = limit(valve_spool(&machine->cylinder[i], out->u), SCALAR(-1), SCALAR(1));
+        const scalar spool = valve_spool(&machine->cylinder[i], out->u);
+        const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);
+        out->u = limit(spool + lead, SCALAR(-1), SCALAR(1));
         trajectory_advance(&controller->trajectory[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
