@@ -39,6 +39,7 @@ __all__ = [
     "HubPort",
     "InprocPort",
     "PythonCanPort",
+    "SlcanSocketPort",
     "SocketCanPort",
     "connect_python_can",
     "open_frame_port",
@@ -53,6 +54,8 @@ _FORMS = (
 )
 _WITHOUT_KERNEL = f"or do without: --bus tcp:127.0.0.1:{DEFAULT_PORT}, --bus inproc, or tools/vcan_vm"
 _SERIAL_BITRATE = 1_000_000  # of the CAN side of a serial adapter: the ECU's bus
+_SLCAN_SOCKET = "socket://"
+_SLCAN_CLOSE_LIMIT_S = 0.2  # how long to wait for the answer to a close
 
 _CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _ARPHRD_CAN, _IFF_UP = 280, 1
@@ -206,7 +209,7 @@ def open_frame_port(address: BusAddress | str, host_hub: bool = False, *, allow_
     Returns
     -------
     FramePort
-        `HubPort`, `SocketCanPort`, `PythonCanPort` or `InprocPort`.
+        `HubPort`, `SocketCanPort`, `SlcanSocketPort`, `PythonCanPort` or `InprocPort`.
 
     Raises
     ------
@@ -219,6 +222,8 @@ def open_frame_port(address: BusAddress | str, host_hub: bool = False, *, allow_
         return InprocPort()
     if address.kind == "socketcan":
         return SocketCanPort(address)
+    if address.kind == "slcan" and address.channel.startswith(_SLCAN_SOCKET):
+        return SlcanSocketPort(address)
     if address.kind == "tcp" and host_hub:
         return HubPort(Hub(address.host, address.port, allow_remote=allow_remote))
     return PythonCanPort(connect_python_can(address), str(address))
@@ -467,6 +472,104 @@ def _socketcan_lost(name: str, error: OSError) -> BusError:
     if error.errno in (errno.ENETDOWN, errno.ENXIO, errno.ENODEV):
         return BusError(f"{name} went down ({error.strerror}): `sudo ip link set up {name}`, then restart")
     return BusError(f"{name}: {error.strerror or error}; look: `ip -details link show {name}`")
+
+
+# ---- slcan over a socket -------------------------------------------------------------------------
+
+
+class SlcanSocketPort(FramePort):
+    """SLCAN text over TCP: an emulated board's UART.
+
+    python-can reads such a text byte by byte, with two system calls each; this one reads what there is.
+    """
+
+    def __init__(self, address: BusAddress) -> None:
+        super().__init__()
+        self.name = str(address)
+        host, _, port = address.channel.removeprefix(_SLCAN_SOCKET).rpartition(":")
+        try:
+            self._sock = socket.create_connection((host, int(port)), timeout=3.0)
+        except (OSError, ValueError, OverflowError) as error:
+            raise BusError(
+                f"cannot open {self.name}: {error}; is the emulator running and listening there, for example at "
+                "slcan:socket://127.0.0.1:3333?"
+            ) from error
+        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._sock.settimeout(None)
+        self._poll = select.poll()
+        self._poll.register(self._sock, select.POLLIN)
+        self._partial = b""
+        self._inbox: deque[Frame] = deque()
+        self._closed = False
+        self._write(b"O\r")
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame."""
+        self.send_many([(can_id, data)])
+
+    def send_many(self, frames: Iterable[Frame]) -> None:
+        """Send several frames, in order."""
+        text = ""
+        count = 0
+        for can_id, data in frames:
+            _check_frame(can_id, data)
+            text += f"t{can_id:03X}{len(data)}{data.hex().upper()}\r"
+            count += 1
+        self._write(text.encode())
+        self.sent += count
+
+    def receive(self, timeout_s: float | None) -> Frame | None:
+        """Next frame, or None when the time is over."""
+        end = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._inbox:
+            left_ms = None if end is None else max(0.0, end - time.monotonic()) * 1e3
+            if not self._poll.poll(left_ms):
+                return None
+            self._read()
+        self.received += 1
+        return self._inbox.popleft()
+
+    def _write(self, text: bytes) -> None:
+        try:
+            self._sock.sendall(text)
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from error
+
+    def _read(self) -> None:
+        try:
+            chunk = self._sock.recv(1 << 16)
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from error
+        if not chunk:
+            raise self._lost("the far end closed it")
+        lines = (self._partial + chunk.replace(b"\a", b"\r")).split(b"\r")
+        self._partial = lines.pop()
+        for line in lines:
+            if line[:1] == b"t":
+                try:
+                    frame = int(line[1:4], 16), bytes.fromhex(line[5:].decode())
+                    _check_frame(*frame)
+                except ValueError:
+                    self.ignored += 1
+                else:
+                    self._inbox.append(frame)
+            elif line[:1] in (b"T", b"r", b"R"):
+                self.ignored += 1
+
+    def _lost(self, reason: str) -> BusError:
+        return BusError(f"{self.name}: the connection broke ({reason}); is the other side still running?")
+
+    def close(self) -> None:
+        """Leave the bus; the far end has read everything by then, unless it no longer answers."""
+        if self._closed:
+            return
+        self._closed = True
+        with self._sock, contextlib.suppress(OSError):
+            self._sock.sendall(b"C\r")
+            self._sock.settimeout(_SLCAN_CLOSE_LIMIT_S)
+            tail = self._partial or b"\r"
+            while not tail.endswith(b"\r\r") and (chunk := self._sock.recv(1 << 16)):
+                tail = (tail + chunk)[-2:]
 
 
 # ---- python-can (socketcand client, slcan) -------------------------------------------------------

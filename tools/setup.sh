@@ -73,6 +73,8 @@ if [ "$purpose" = test ]; then
     need clang clang
     need candump can-utils
     need ip iproute2
+    need arm-none-eabi-gcc gcc-arm-none-eabi
+    need qemu-system-arm qemu-system-arm
     # A Linux kernel as a program, with the vcan driver; exists for PCs only.
     case $(uname -m) in
     x86_64 | i?86) have linux.uml || kernel_has_vcan || optional+=(user-mode-linux) ;;

@@ -1,0 +1,12 @@
+/* The four functions that a compiler may call on its own, for a toolchain without a C library. */
+#ifndef PORTS_CORTEX_M_FREESTANDING_STRING_H
+#define PORTS_CORTEX_M_FREESTANDING_STRING_H
+
+#include <stddef.h>
+
+void *memcpy(void *restrict to, const void *restrict from, size_t count);
+void *memmove(void *to, const void *from, size_t count);
+void *memset(void *to, int value, size_t count);
+int memcmp(const void *a, const void *b, size_t count);
+
+#endif

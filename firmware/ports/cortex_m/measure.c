@@ -1,0 +1,90 @@
+#include "ports/cortex_m/measure.h"
+
+#if defined(DIARC_COUNT_INSTRUCTIONS)
+
+#include "ports/cortex_m/clock.h"
+#include "ports/cortex_m/registers.h"
+#include "ports/cortex_m/slcan_text.h"
+#include "ports/cortex_m/uart.h"
+
+#define STACK_PATTERN 0xA5A5A5A5u
+#define LAST_LINE 0xFu
+#define LINE_BYTES 27u
+
+extern uint32_t image_stack_begin[], image_stack_end[];
+
+struct figures {
+    uint32_t tick; /* this tick's cycles */
+    uint32_t least, most;
+    uint64_t sum;
+};
+
+static struct figures figures[STAGES];
+static uint32_t ticks;
+static enum stage current = STAGE_WAIT;
+static uint32_t since;
+
+void measure_start(void)
+{
+    const uint32_t *const used = stack_pointer();
+    for (uint32_t *word = image_stack_begin; word < used; word++) {
+        *word = STACK_PATTERN;
+    }
+    since = clock_cycles();
+}
+
+enum stage measure_switch(enum stage stage)
+{
+    interrupts_disable();
+    const uint32_t now = clock_cycles();
+    const enum stage before = current;
+    figures[before].tick += now - since;
+    current = stage;
+    since = now;
+    interrupts_enable();
+    return before;
+}
+
+void measure_end_tick(bool counts)
+{
+    for (uint8_t k = 0; k < STAGES; k++) {
+        struct figures *const f = &figures[k];
+        if (counts) {
+            f->least = ticks == 0u || f->tick < f->least ? f->tick : f->least;
+            f->most = f->tick > f->most ? f->tick : f->most;
+            f->sum += f->tick;
+        }
+        f->tick = 0;
+    }
+    ticks += counts ? 1u : 0u;
+}
+
+static void answer(uint32_t stage, uint32_t a, uint32_t b, uint32_t c)
+{
+    uint8_t line[LINE_BYTES] = {(uint8_t)'M'};
+    slcan_write_hex(&line[1], stage, 1);
+    slcan_write_hex(&line[2], a, 8);
+    slcan_write_hex(&line[10], b, 8);
+    slcan_write_hex(&line[18], c, 8);
+    line[26] = (uint8_t)'\r';
+    (void)uart_send(line, LINE_BYTES);
+}
+
+bool measure_command(uint8_t verb)
+{
+    if (verb != (uint8_t)'M') {
+        return false;
+    }
+    for (uint8_t k = 0; k < STAGES; k++) {
+        const struct figures *const f = &figures[k];
+        answer(k, f->least, ticks > 0u ? (uint32_t)(f->sum / ticks) : 0u, f->most);
+    }
+    const uint32_t *word = image_stack_begin;
+    while (word < image_stack_end && *word == STACK_PATTERN) {
+        word++;
+    }
+    answer(LAST_LINE, ticks, (uint32_t)(image_stack_end - word) * 4u, 0);
+    return true;
+}
+
+#endif

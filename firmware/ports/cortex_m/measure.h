@@ -1,0 +1,50 @@
+/* With DIARC_COUNT_INSTRUCTIONS: how many processor cycles each stage of a tick takes, and the stack's
+ * depth. Where an instruction takes a fixed time, as in QEMU with -icount, the cycles count instructions.
+ * Else nothing of this is in the image. The SLCAN command M answers for all ticks in RUN, in hexadecimal:
+ *
+ *     M STAGE least mean most     a line for each stage: one digit and three times eight, without spaces
+ *     MF ticks stack 0            the ticks counted, the bytes of stack used */
+#ifndef PORTS_CORTEX_M_MEASURE_H
+#define PORTS_CORTEX_M_MEASURE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* Every cycle counts for one stage. */
+enum stage {
+    STAGE_WAIT,    /* between ticks and for frames */
+    STAGE_UART,    /* interrupts: a byte from and to the UART; a CAN peripheral needs none of it */
+    STAGE_RECEIVE, /* SLCAN text to frames, their checks, requests */
+    STAGE_LAW,     /* SYNC, the samples, estimator and law, packing of frames */
+    STAGE_SEND,    /* frames to SLCAN text */
+    STAGES
+};
+
+#if defined(DIARC_COUNT_INSTRUCTIONS)
+void measure_start(void);
+/* What follows counts for `stage`; the stage before. */
+enum stage measure_switch(enum stage stage);
+/* A tick is over; it is taken into the figures when `counts`. */
+void measure_end_tick(bool counts);
+/* Answers M; false when the command is another. */
+bool measure_command(uint8_t verb);
+#else
+static inline void measure_start(void)
+{
+}
+static inline enum stage measure_switch(enum stage stage)
+{
+    return stage;
+}
+static inline void measure_end_tick(bool counts)
+{
+    (void)counts;
+}
+static inline bool measure_command(uint8_t verb)
+{
+    (void)verb;
+    return false;
+}
+#endif
+
+#endif
