@@ -56,9 +56,27 @@ static void law_parameters(const struct controller *controller, scalar theta[THE
     }
 }
 
+/* What estimator and law both need of a joint's valve and cylinder; its roots are taken once. */
+struct joint_flow {
+    scalar gain_extending; /* QL per unit opening */
+    scalar gain_retracting;
+    scalar leakage; /* m^2/s */
+};
+
+static struct joint_flow joint_flow(const struct machine *machine, enum joint i,
+                                    const struct cylinder_state *state, const scalar p[CHAMBERS])
+{
+    const struct cylinder *const cylinder = &machine->cylinder[i];
+    return (struct joint_flow){
+        .gain_extending = valve_gain(cylinder, &machine->supply, state, p, true),
+        .gain_retracting = valve_gain(cylinder, &machine->supply, state, p, false),
+        .leakage = cylinder_leakage(cylinder, state, p),
+    };
+}
+
 static void estimate(struct controller *controller, const struct machine *machine,
                      const struct controller_constants *constants, const struct measurement *measured,
-                     struct estimator_sample *sample)
+                     struct estimator_sample *sample, struct joint_flow flow[JOINTS])
 {
     sample->trig = wrist_trig(&machine->arm, measured->q[WRIST]);
     for (uint8_t i = 0; i < JOINTS; i++) {
@@ -72,10 +90,9 @@ static void estimate(struct controller *controller, const struct machine *machin
                                ? mul(sample->cylinder[i].R, constants->cylinder[i].lever_inverse)
                                : SCALAR(1);
         const scalar opening = valve_opening(cylinder, measured->spool[i]);
-        const bool extending = opening >= SCALAR(0);
-        sample->flow[i] =
-            mul(opening, valve_gain(cylinder, &machine->supply, &sample->cylinder[i], p, extending)) -
-            cylinder_leakage(cylinder, &sample->cylinder[i], p);
+        flow[i] = joint_flow(machine, (enum joint)i, &sample->cylinder[i], p);
+        const scalar valve = opening >= SCALAR(0) ? flow[i].gain_extending : flow[i].gain_retracting;
+        sample->flow[i] = mul(opening, valve) - flow[i].leakage;
     }
     estimator_step(&controller->estimator, &machine->estimator, &constants->estimator, &machine->arm, sample);
 }
@@ -92,8 +109,8 @@ static scalar torque_uncertainty(const struct estimator_constants *constants, co
 }
 
 static scalar diarc_joint(struct controller *controller, const struct machine *machine,
-                          const struct controller_constants *constants, const struct measurement *measured,
-                          const struct estimator_sample *sample, enum joint i, const scalar theta[THETA_M],
+                          const struct controller_constants *constants, const struct estimator_sample *sample,
+                          const struct joint_flow *flow, enum joint i, const scalar theta[THETA_M],
                           const struct wrist_trig *desired, struct joint_output *out)
 {
     const scalar w[JOINTS] = {controller->output[SWING].reference.w, controller->output[WRIST].reference.w};
@@ -125,9 +142,9 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
         .flow_uncertainty = mul(c->lamB, ranges->scale_h[om2]) + mul(c->lamC, ranges->scale_h[om3]),
         .cylinder = *c,
         .force = sample->force[i],
-        .leakage = cylinder_leakage(&machine->cylinder[i], c, measured->p[i]),
-        .gain_extending = valve_gain(&machine->cylinder[i], &machine->supply, c, measured->p[i], true),
-        .gain_retracting = valve_gain(&machine->cylinder[i], &machine->supply, c, measured->p[i], false),
+        .leakage = flow->leakage,
+        .gain_extending = flow->gain_extending,
+        .gain_retracting = flow->gain_retracting,
     };
     if (!controller->diarc[i].started) {
         diarc_start(&controller->diarc[i], &machine->diarc[i], &in);
@@ -154,7 +171,8 @@ void controller_step(struct controller *controller, const struct machine *machin
     }
 
     struct estimator_sample sample;
-    estimate(controller, machine, constants, measured, &sample);
+    struct joint_flow flow[JOINTS];
+    estimate(controller, machine, constants, measured, &sample, flow);
     if (!controller->armed) {
         return;
     }
@@ -173,7 +191,7 @@ void controller_step(struct controller *controller, const struct machine *machin
                     controller->law_m_before[k] = theta[k];
                 }
             }
-            out->u = diarc_joint(controller, machine, constants, measured, &sample, (enum joint)i, theta,
+            out->u = diarc_joint(controller, machine, constants, &sample, &flow[i], (enum joint)i, theta,
                                  &desired, out);
         }
         const scalar spool = valve_spool(&machine->cylinder[i], out->u);
