@@ -60,15 +60,17 @@ def wait_for_ecu(port: FramePort, bus: str, alive: Callable[[], None]) -> None:
     """
     heartbeat_id = protocol.frame_id("HEARTBEAT_ECU")
     if not _heard(port, ECU_WAIT_S, lambda can_id, _: can_id in (protocol.SYNC_ID, heartbeat_id), alive):
-        raise EcuMissingError(
-            f"no ECU on {bus} within {ECU_WAIT_S:g} s; start one: ./firmware/diarc_ecu {bus}   "
-            "(or let run.py start it: --ecu spawn)"
+        how = (
+            "is the board powered and running its image? docs/porting.md"
+            if bus.startswith("slcan:")
+            else f"start one: ./firmware/diarc_ecu {bus}   (or let run.py start it: --ecu spawn)"
         )
+        raise EcuMissingError(f"no ECU on {bus} within {ECU_WAIT_S:g} s; {how}")
     port.send(*from_row(nmt_frame(NMT_RESET)))
     if not _heard(port, BOOT_WAIT_S, lambda can_id, data: can_id == heartbeat_id and data == b"\0", alive):
         raise EcuMissingError(
-            f"the ECU on {bus} does not restart on NMT reset; is it this version's? Start it anew: "
-            f"./firmware/diarc_ecu {bus}"
+            f"the ECU on {bus} does not restart on NMT reset; is it this version's? Build it (make firmware, make "
+            "images) and start it anew"
         )
 
 
