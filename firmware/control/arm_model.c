@@ -84,7 +84,7 @@ scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar thet
 {
     scalar torque = row->known;
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        torque += mul(row->phi[k], theta[row_parameter[i][k]]);
+        torque = add_limited(torque, mul(row->phi[k], theta[row_parameter[i][k]]));
     }
     return torque;
 }

@@ -103,7 +103,7 @@ static scalar torque_uncertainty(const struct estimator_constants *constants, co
 {
     scalar sum = SCALAR(0);
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        sum += mul(constants->scale_m[row_parameter[i][k]], absolute(row->phi[k]));
+        sum = add_limited(sum, mul(constants->scale_m[row_parameter[i][k]], absolute(row->phi[k])));
     }
     return sum;
 }
@@ -126,7 +126,8 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     scalar torque_step = SCALAR(0);
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
         const uint8_t parameter = row_parameter[i][k];
-        torque_step += mul(phi2.phi[k], theta[parameter] - controller->law_m_before[parameter]);
+        torque_step = add_limited(torque_step,
+                                  mul(phi2.phi[k], theta[parameter] - controller->law_m_before[parameter]));
     }
     const struct diarc_input in = {
         .e1 = out->e1,

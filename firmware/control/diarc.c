@@ -30,26 +30,31 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
     s.e2 = in->e1_rate + amp(gains->k1, in->e1); /* Eq 11 */
     const scalar k2s1 = robust_gain(gains->gamma1_max + in->torque_uncertainty, gains->eta1,
                                     amp(gains->k2s1_max, H)); /* Eq 22 */
-    const scalar feedback = mul(H, amp(gains->k2, s.e2));
+    const scalar feedback = amp(gains->k2, mul(H, s.e2));
     s.F_Ld = quot(in->torque_ff - feedback - diarc->gamma1 - mul(k2s1, s.e2), R); /* Eq 14, 20 */
 
     /* F_Ld'_c: the feed-forward's difference, free of noise, and the feedback's analytic derivative with
      * H e2'^ from the model: H (q''^ - qd'') = R F - phi2' theta^ + gamma1. R' is left out: 0.1 % of it. */
     const scalar H_e2_rate =
-        mul(R, in->force) - in->torque_ff + diarc->gamma1 + mul(H, amp(gains->k1, in->e1_rate));
-    const scalar gamma1_rate = amp(gains->kappa1, mul(H, s.e2));                         /* Eq 20 */
-    const scalar F_Ld_rate = quot(ff_rate - amp(gains->k2, H_e2_rate) - gamma1_rate, R); /* Eq 17 */
+        mul(R, in->force) - in->torque_ff + diarc->gamma1 + amp(gains->k1, mul(H, in->e1_rate));
+    const scalar gamma1_rate = amp(gains->kappa1, mul(H, s.e2)); /* Eq 20 */
+    const scalar compliance = quot(in->beta_inverse, R); /* as a factor of the terms it keeps them small */
+    const scalar F_Ld_flow = mul(compliance, ff_rate - gamma1_rate) -
+                             amp(gains->k2, mul(compliance, H_e2_rate)); /* theta_8 F_Ld'_c, Eq 17 */
 
     /* step 2: flow */
     s.e3 = in->force - s.F_Ld;
     const scalar w = in->reference_w + in->e1_rate;
     const scalar mu = -mul(gains->w1_over_w2, mul(R, s.e2)); /* Eq 18 */
+    const scalar beta_share = quot(in->beta_uncertainty, in->beta_inverse);
     const scalar k2s2 =
-        robust_gain(gains->gamma2_max + in->flow_uncertainty + mul(in->beta_uncertainty, absolute(F_Ld_rate)),
+        robust_gain(gains->gamma2_max + in->flow_uncertainty + mul(beta_share, absolute(F_Ld_flow)),
                     gains->eta2, amp(gains->k2s2_max, in->beta_inverse));
-    s.Q_Ld = mul(in->cylinder.lamA, mul(R, w)) + mul(in->beta_inverse, F_Ld_rate) + in->leakage -
-             in->flow_offset - mul(in->beta_inverse, amp(gains->k3, s.e3)) + mu - diarc->gamma2 -
-             mul(k2s2, s.e3); /* Eq 18, 20 */
+    /* Eq 18, 20: what the motion takes, less what the offsets give and the feedback asks */
+    const scalar motion = add_limited(mul(in->cylinder.lamA, mul(R, w)), F_Ld_flow);
+    const scalar offsets = add_limited(in->leakage - in->flow_offset, mu - diarc->gamma2);
+    const scalar force_feedback = amp(gains->k3, mul(in->beta_inverse, s.e3)) + mul(k2s2, s.e3);
+    s.Q_Ld = add_limited(add_limited(motion, offsets), -force_feedback);
     return s;
 }
 
@@ -84,7 +89,7 @@ struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *ga
         diarc->gamma1 = symmetric_limit(diarc->gamma1 + mul(dt_s, amp(gains->kappa1, mul(in->H, s.e2))),
                                         gains->gamma1_max);
         diarc->gamma2 = symmetric_limit(
-            diarc->gamma2 + mul(dt_s, mul(in->beta_inverse, amp(gains->kappa2, s.e3))), gains->gamma2_max);
+            diarc->gamma2 + mul(dt_s, amp(gains->kappa2, mul(in->beta_inverse, s.e3))), gains->gamma2_max);
     }
     return (struct diarc_output){.u = u, .F_Ld = s.F_Ld, .e2 = s.e2, .e3 = s.e3, .saturated = saturated};
 }

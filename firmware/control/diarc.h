@@ -19,7 +19,7 @@ struct diarc_gains {
     gain k2s2_max;     /* bound of the robust gain of step 2, 1/s times 1/be */
     scalar gamma1_max; /* gamma_M of torque, N m */
     scalar gamma2_max; /* gamma_M of flow, m^2/s */
-    scalar spool_lead;        /* share of the spool's lag behind its set-point that is added to it */
+    scalar spool_lead; /* share of the spool's lag behind its set-point that is added to it */
 };
 
 /* What one joint's law sees at one tick. */

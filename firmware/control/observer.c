@@ -1,5 +1,8 @@
 #include "control/observer.h"
 
+/* No joint of any machine is faster, rad/s; an encoder that jumps could otherwise drive the state anywhere. */
+#define RATE_LIMIT SCALAR(30)
+
 struct observer_constants observer_constants(gain bandwidth, scalar dt_s)
 {
     /* rho = exp(-x) by the (2,2) Pade approximant, error below 2e-3 for x <= 1: the pole need not be exact */
@@ -24,5 +27,5 @@ void observer_step(struct observer *observer, const struct observer_constants *c
     const scalar predicted = observer->e + mul(dt_s, observer->w);
     const scalar innovation = e - predicted;
     observer->e = predicted + mul(constants->correct_error, innovation);
-    observer->w = observer->w + amp(constants->correct_rate, innovation);
+    observer->w = limit(observer->w + amp(constants->correct_rate, innovation), -RATE_LIMIT, RATE_LIMIT);
 }

@@ -72,4 +72,8 @@ int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high
 scalar scalar_from_real32(uint32_t bits, int8_t exponent);
 gain gain_from_real32(uint32_t bits, int8_t exponent);
 
+/* Whether the type holds such a number with the room that sums and products need. */
+bool scalar_holds_real32(uint32_t bits, int8_t exponent);
+bool gain_holds_real32(uint32_t bits, int8_t exponent);
+
 #endif

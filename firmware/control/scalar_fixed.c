@@ -45,12 +45,12 @@ scalar arctangent(scalar y, scalar x)
     int32_t ratio;
     if (mul(a, TAN_PI_8) > x) {
         offset = HALF_PI;
-        ratio = -fixed_quotient(x, a, ARGUMENT_FRACTION);
+        ratio = -fixed_quotient(x, a, ARGUMENT_FRACTION, INT32_MAX);
     } else if (a > mul(x, TAN_PI_8)) {
         offset = QUARTER_PI;
-        ratio = fixed_quotient(a - x, a + x, ARGUMENT_FRACTION);
+        ratio = fixed_quotient(a - x, a + x, ARGUMENT_FRACTION, INT32_MAX);
     } else {
-        ratio = fixed_quotient(a, x, ARGUMENT_FRACTION);
+        ratio = fixed_quotient(a, x, ARGUMENT_FRACTION, INT32_MAX);
     }
     const scalar angle = offset + odd_polynomial(ARCTANGENT, ratio);
     return y < SCALAR(0) ? -angle : angle;
@@ -97,12 +97,12 @@ static uint32_t magnitude_of(int32_t x)
     return x < 0 ? (uint32_t) - (int64_t)x : (uint32_t)x;
 }
 
-int32_t fixed_quotient(int32_t a, int32_t b, uint8_t shift)
+int32_t fixed_quotient(int32_t a, int32_t b, uint8_t shift, int32_t most)
 {
     const uint64_t numerator = (uint64_t)magnitude_of(a) << shift;
     const uint32_t denominator = magnitude_of(b);
-    int32_t quotient = FIXED_LIMIT; /* what the quotient of anything and nothing is */
-    if (numerator < (uint64_t)denominator * (uint32_t)FIXED_LIMIT) {
+    int32_t quotient = most;
+    if (numerator < (uint64_t)denominator * (uint32_t)most) {
         quotient = (int32_t)divide(numerator, denominator);
     }
     return (a < 0) != (b < 0) ? -quotient : quotient;
@@ -189,6 +189,22 @@ static int32_t from_real32(uint32_t bits, int16_t exponent, uint8_t fraction_bit
         magnitude = 0;
     }
     return (bits >> 31) != 0u ? -magnitude : magnitude;
+}
+
+/* |number| < 2^(exponent + whole_bits) */
+static bool below(uint32_t bits, int8_t exponent, uint8_t whole_bits)
+{
+    return (int16_t)((bits >> 23) & 0xFFu) - 127 < exponent + whole_bits;
+}
+
+bool scalar_holds_real32(uint32_t bits, int8_t exponent)
+{
+    return below(bits, exponent, 29 - SCALAR_FRACTION);
+}
+
+bool gain_holds_real32(uint32_t bits, int8_t exponent)
+{
+    return below(bits, exponent, 31 - GAIN_FRACTION);
 }
 
 scalar scalar_from_real32(uint32_t bits, int8_t exponent)

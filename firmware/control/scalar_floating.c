@@ -106,6 +106,18 @@ scalar scalar_from_real32(uint32_t bits, int8_t exponent)
     return (bits >> 31) != 0u ? -magnitude : magnitude;
 }
 
+bool scalar_holds_real32(uint32_t bits, int8_t exponent)
+{
+    (void)bits;
+    (void)exponent;
+    return true;
+}
+
+bool gain_holds_real32(uint32_t bits, int8_t exponent)
+{
+    return scalar_holds_real32(bits, exponent);
+}
+
 gain gain_from_real32(uint32_t bits, int8_t exponent)
 {
     return scalar_from_real32(bits, exponent);

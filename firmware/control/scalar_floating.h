@@ -41,6 +41,21 @@ static inline gain gain_quot(scalar a, scalar b)
     return a / b;
 }
 
+static inline gain gain_part(gain k, uint32_t parts)
+{
+    return k / (gain)parts;
+}
+
+static inline scalar add_limited(scalar a, scalar b)
+{
+    return a + b;
+}
+
+static inline variance add_variance(variance a, variance b)
+{
+    return a + b;
+}
+
 static inline scalar fraction(uint32_t part, uint32_t whole)
 {
     return (scalar)part / (scalar)whole;

@@ -18,7 +18,7 @@ bool trajectory_start(struct trajectory *trajectory, scalar target, uint32_t tic
     trajectory->distance = target - trajectory->start;
     trajectory->ticks = ticks;
     trajectory->tick = 0;
-    trajectory->per_second = gain_quot(fraction(1, ticks), dt_s);
+    trajectory->per_second = gain_part(gain_quot(SCALAR(1), dt_s), ticks);
     return true;
 }
 

@@ -23,15 +23,15 @@ variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, ga
         scalar *const Uj = j > 0 ? &ud->U[column(j)] : ud->U;
         scalar f = phi[j]; /* f = U' phi */
         for (uint8_t i = 0; i < j; i++) {
-            f += mul(Uj[i], phi[i]);
+            f = add_limited(f, mul(Uj[i], phi[i]));
         }
         const variance v = scale_variance(ud->D[j], f); /* v = D f */
         const variance alpha_before = alpha;
-        alpha += scale_variance(v, f);
+        alpha = add_variance(alpha, scale_variance(v, f));
         for (uint8_t i = 0; i < j; i++) {
             const scalar u = Uj[i];
-            Uj[i] = u - amp(variance_ratio(P_phi[i], alpha_inverse), f);
-            P_phi[i] += scale_variance(v, u);
+            Uj[i] = add_limited(u, -amp(variance_ratio(P_phi[i], alpha_inverse), f));
+            P_phi[i] = add_variance(P_phi[i], scale_variance(v, u));
         }
         P_phi[j] = v;
         alpha_inverse = invert(alpha);
@@ -48,7 +48,7 @@ variance ud_variance(const struct ud_factors *ud, uint8_t k)
     variance sum = ud->D[k];
     for (uint8_t j = (uint8_t)(k + 1); j < ud->size; j++) {
         const scalar u = ud->U[column(j) + k];
-        sum += scale_variance(scale_variance(ud->D[j], u), u);
+        sum = add_variance(sum, scale_variance(scale_variance(ud->D[j], u), u));
     }
     return sum;
 }

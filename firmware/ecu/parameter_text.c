@@ -24,7 +24,9 @@ const char *ecu_status_text(enum ecu_status status)
     case ECU_IMAGE_BASES:
         return "has per-unit bases outside their ranges (can_protocol/parameters.toml)";
     case ECU_PARAMETER_RANGE:
-        return "has a parameter outside its range (can_protocol/parameters.toml)";
+        return "has a parameter outside its range (can_protocol/parameters.toml), or too large for fixed "
+               "point with "
+               "these bases";
     case ECU_PARAMETER_RELATION:
         return "has a parameter that contradicts another: ends of a range swapped, rod thicker than bore, a "
                "prior "

@@ -180,8 +180,11 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
     }
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
         const uint32_t bits = image_bits(image, k);
+        const int8_t exponent = base_of(&TABLE[k], &found);
+        const bool held = TABLE[k].kind == PARAMETER_GAIN ? gain_holds_real32(bits, exponent)
+                                                          : scalar_holds_real32(bits, exponent);
         if (!real32_is_number(bits) || real32_order(bits) < real32_order(TABLE[k].low) ||
-            real32_order(bits) > real32_order(TABLE[k].high)) {
+            real32_order(bits) > real32_order(TABLE[k].high) || !held) {
             *entry = k;
             return ECU_PARAMETER_RANGE;
         }

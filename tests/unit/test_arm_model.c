@@ -1,26 +1,29 @@
-/* The arm's equations (control/arm_model) against mechanics: momentum, energy, gravity, signs. SI throughout:
- * the equations do not care about bases. */
+/* The arm's equations (control/arm_model) against mechanics: momentum, energy, gravity, signs. Torques, masses and
+ * inertias are over 2^TORQUE_BASE, so that every number type holds them; the assertions are in SI. */
 #include "control/arm_model.h"
 #include "testing.h"
 
 /* N m, of torques up to 100 N m; the rates are numeric, over STEP_S. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define TOLERANCE 1e-9
-#define RATE_TOLERANCE 1e-7
-#define STEP_S 1e-3
-#else
-#define TOLERANCE 1e-4
-#define RATE_TOLERANCE 2e-2
-#define STEP_S 2e-2
-#endif
+#define TOLERANCE BY_TYPE(1e-9, 1e-4, 3e-6)
+#define RATE_TOLERANCE BY_TYPE(1e-7, 2e-2, 1.5e-4)
+#define STEP_S BY_TYPE(1e-3, 2e-2, 2e-2)
+
+#define TORQUE_BASE 4
+#define OVER_BASE(si) SCALAR((si) / 16.0)
 
 static const struct arm ARM = {
-    .L1 = SCALAR(0.8), .L2 = SCALAR(0.4), .I1 = SCALAR(3), .g = SCALAR(9.81), .coulomb_slope = GAIN(900)};
+    .L1 = SCALAR(0.8),
+    .L2 = SCALAR(0.4),
+    .I1 = OVER_BASE(3),
+    .g = SCALAR(9.81),
+    .coulomb_rate = SCALAR(1.0 / 900),
+};
 
 /* 5 kg at the tip of the reference arm. */
 static const scalar THETA[THETA_M] = {
-    [M_T] = SCALAR(5), [J] = SCALAR(0.8 / 3), [M2] = SCALAR(5),  [FV1] = SCALAR(12),   [FV2] = SCALAR(4),
-    [FC1] = SCALAR(6), [FC2] = SCALAR(2),     [OM1] = SCALAR(3), [OM2] = SCALAR(-0.7),
+    [M_T] = OVER_BASE(5),  [J] = OVER_BASE(0.8 / 3), [M2] = OVER_BASE(5),
+    [FV1] = OVER_BASE(12), [FV2] = OVER_BASE(4),     [FC1] = OVER_BASE(6),
+    [FC2] = OVER_BASE(2),  [OM1] = OVER_BASE(3),     [OM2] = OVER_BASE(-0.7),
 };
 
 /* Where friction acts at the cylinder: the lever arm over that at q = 0. */
@@ -34,15 +37,26 @@ void tearDown(void)
 {
 }
 
+static double si(scalar x)
+{
+    return si_of(x, TORQUE_BASE);
+}
+
+/* What the smooth sign of friction must be, for the rate and the constant that the type can hold. */
+static double smooth_sign(scalar w)
+{
+    return 2 / PI_REAL * atan(real(w) / real(ARM.coulomb_rate));
+}
+
 /* A smooth motion of both joints, nowhere at rest for long. */
 static void motion(double t, scalar q[JOINTS], scalar w[JOINTS], scalar a[JOINTS])
 {
-    q[SWING] = SCALAR(0.4 * sin(1.3 * t));
-    w[SWING] = SCALAR(0.4 * 1.3 * cos(1.3 * t));
-    a[SWING] = SCALAR(-0.4 * 1.3 * 1.3 * sin(1.3 * t));
-    q[WRIST] = SCALAR(0.2 + 0.7 * sin(1.9 * t + 0.5));
-    w[WRIST] = SCALAR(0.7 * 1.9 * cos(1.9 * t + 0.5));
-    a[WRIST] = SCALAR(-0.7 * 1.9 * 1.9 * sin(1.9 * t + 0.5));
+    q[SWING] = from_real(0.4 * sin(1.3 * t));
+    w[SWING] = from_real(0.4 * 1.3 * cos(1.3 * t));
+    a[SWING] = from_real(-0.4 * 1.3 * 1.3 * sin(1.3 * t));
+    q[WRIST] = from_real(0.2 + 0.7 * sin(1.9 * t + 0.5));
+    w[WRIST] = from_real(0.7 * 1.9 * cos(1.9 * t + 0.5));
+    a[WRIST] = from_real(-0.7 * 1.9 * 1.9 * sin(1.9 * t + 0.5));
 }
 
 /* theta without friction and offset. */
@@ -101,11 +115,11 @@ static void test_momentum_form_is_another_model_than_the_inverse_dynamics(void)
             for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
                 double y[4];
                 for (uint8_t n = 0; n < 4; n++) {
-                    y[n] = real(k < ROW_COLUMNS ? momentum[n].phi[k] : momentum[n].known);
+                    y[n] = k < ROW_COLUMNS ? real(momentum[n].phi[k]) : si(momentum[n].known);
                 }
-                const scalar f = k < ROW_COLUMNS ? force.phi[k] : force.known;
-                const scalar expected = k < ROW_COLUMNS ? whole.phi[k] : whole.known;
-                TEST_ASSERT_DOUBLE_WITHIN(RATE_TOLERANCE, real(expected), slope(y, STEP_S) + real(f));
+                const double f = k < ROW_COLUMNS ? real(force.phi[k]) : si(force.known);
+                const double expected = k < ROW_COLUMNS ? real(whole.phi[k]) : si(whole.known);
+                TEST_ASSERT_DOUBLE_WITHIN(RATE_TOLERANCE, expected, slope(y, STEP_S) + f);
             }
         }
     }
@@ -115,14 +129,14 @@ static void test_inertia_is_not_that_of_the_momentum(void)
 {
     /* GIVEN any angle WHEN a joint turns THEN its momentum is H_ii times its rate, whatever the other does */
     for (double q2 = -1; q2 <= 1.2; q2 += 0.1) {
-        const struct wrist_trig t = wrist_trig(&ARM, SCALAR(q2));
+        const struct wrist_trig t = wrist_trig(&ARM, from_real(q2));
         const scalar w[JOINTS] = {SCALAR(0.7), SCALAR(-1.1)};
         for (uint8_t i = 0; i < JOINTS; i++) {
             struct arm_row row;
             arm_momentum(&ARM, &t, (enum joint)i, w, &row);
-            const double H = real(arm_inertia(&ARM, &t, (enum joint)i, THETA));
+            const double H = si(arm_inertia(&ARM, &t, (enum joint)i, THETA));
             TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, H * real(w[i]),
-                                      real(arm_row_torque(&row, (enum joint)i, THETA)));
+                                      si(arm_row_torque(&row, (enum joint)i, THETA)));
         }
     }
 }
@@ -133,11 +147,11 @@ static void test_inertia_of_the_reference_arm_wrong(void)
     const struct wrist_trig level = wrist_trig(&ARM, SCALAR(0));
     const struct wrist_trig up = wrist_trig(&ARM, SCALAR(PI_REAL / 2));
     /* 3 + 5 0.8 1.2 + 0.2667 + 5 1.44 and 3 + 5 0.64 + 0 + 5 0.64 */
-    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 15.2666667, real(arm_inertia(&ARM, &level, SWING, THETA)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 9.4, real(arm_inertia(&ARM, &up, SWING, THETA)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 15.2666667, si(arm_inertia(&ARM, &level, SWING, THETA)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 9.4, si(arm_inertia(&ARM, &up, SWING, THETA)));
     /* 0.2667 + 5 0.16 */
-    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 1.0666667, real(arm_inertia(&ARM, &level, WRIST, THETA)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 1.0666667, real(arm_inertia(&ARM, &up, WRIST, THETA)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 1.0666667, si(arm_inertia(&ARM, &level, WRIST, THETA)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-5, 1.0666667, si(arm_inertia(&ARM, &up, WRIST, THETA)));
 }
 
 /* C(q, q') q': what is left of the inverse dynamics without acceleration, friction, offset and gravity. */
@@ -149,7 +163,7 @@ static void coriolis(scalar q2, const scalar w[JOINTS], double C_w[JOINTS])
     frictionless(theta);
     static const scalar none[JOINTS] = {SCALAR(0), SCALAR(0)};
     for (uint8_t i = 0; i < JOINTS; i++) {
-        C_w[i] = real(torque(&weightless, q2, (enum joint)i, w, none, theta));
+        C_w[i] = si(torque(&weightless, q2, (enum joint)i, w, none, theta));
     }
 }
 
@@ -167,18 +181,18 @@ static void test_coriolis_terms_make_energy(void)
         double C_x[JOINTS];
         double C_sum[JOINTS];
         for (uint8_t i = 0; i < JOINTS; i++) {
-            w[i] = SCALAR(lcg_uniform(&noise, -2, 2));
-            x[i] = SCALAR(lcg_uniform(&noise, -2, 2));
+            w[i] = from_real(lcg_uniform(&noise, -2, 2));
+            x[i] = from_real(lcg_uniform(&noise, -2, 2));
             sum[i] = w[i] + x[i];
         }
-        coriolis(SCALAR(q2), w, C_w);
-        coriolis(SCALAR(q2), x, C_x);
-        coriolis(SCALAR(q2), sum, C_sum);
+        coriolis(from_real(q2), w, C_w);
+        coriolis(from_real(q2), x, C_x);
+        coriolis(from_real(q2), sum, C_sum);
         double H[4];
         static const int at[4] = {-2, -1, 1, 2};
         for (uint8_t k = 0; k < 4; k++) {
-            const struct wrist_trig t = wrist_trig(&ARM, SCALAR(q2 + at[k] * STEP_S));
-            H[k] = real(arm_inertia(&ARM, &t, SWING, THETA));
+            const struct wrist_trig t = wrist_trig(&ARM, from_real(q2 + at[k] * STEP_S));
+            H[k] = si(arm_inertia(&ARM, &t, SWING, THETA));
         }
         /* H22 is constant */
         const double x_H_rate_x = slope(H, STEP_S) * real(w[WRIST]) * real(x[SWING]) * real(x[SWING]);
@@ -197,11 +211,11 @@ static void test_gravity_pulls_the_wrong_way(void)
     static const scalar still[JOINTS] = {SCALAR(0), SCALAR(0)};
     scalar theta[THETA_M];
     frictionless(theta);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 29.43, real(torque(&ARM, SCALAR(0), WRIST, still, still, theta)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 29.43, si(torque(&ARM, SCALAR(0), WRIST, still, still, theta)));
     TEST_ASSERT_DOUBLE_WITHIN(1e-4, 29.43 * 0.5,
-                              real(torque(&ARM, SCALAR(PI_REAL / 3), WRIST, still, still, theta)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 0, real(torque(&ARM, SCALAR(PI_REAL / 2), WRIST, still, still, theta)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0, real(torque(&ARM, SCALAR(0.3), SWING, still, still, theta)));
+                              si(torque(&ARM, SCALAR(PI_REAL / 3), WRIST, still, still, theta)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 0, si(torque(&ARM, SCALAR(PI_REAL / 2), WRIST, still, still, theta)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0, si(torque(&ARM, SCALAR(0.3), SWING, still, still, theta)));
 }
 
 static void test_centrifugal_force_lifts_the_load(void)
@@ -215,8 +229,8 @@ static void test_centrifugal_force_lifts_the_load(void)
     const double s = sin(0.5);
     const double c = cos(0.5);
     const double by_hand = 4 * (0.4 * s * (5 * (0.8 + 0.4 * c) + 5 * 0.8 / 2) + 0.8 / 3 * c * s);
-    const double held = real(torque(&ARM, SCALAR(0.5), WRIST, still, still, theta));
-    const double spun = real(torque(&ARM, SCALAR(0.5), WRIST, turning, still, theta));
+    const double held = si(torque(&ARM, SCALAR(0.5), WRIST, still, still, theta));
+    const double spun = si(torque(&ARM, SCALAR(0.5), WRIST, turning, still, theta));
     TEST_ASSERT_DOUBLE_WITHIN(1e-4, by_hand, spun - held);
     TEST_ASSERT_TRUE(by_hand > 1);
 }
@@ -230,7 +244,7 @@ static double energy_at(double time)
     const struct wrist_trig t = wrist_trig(&ARM, q[WRIST]);
     double energy = 9.81 * 0.4 * real(t.s) * (2.5 + 5);
     for (uint8_t i = 0; i < JOINTS; i++) {
-        energy += 0.5 * real(arm_inertia(&ARM, &t, (enum joint)i, THETA)) * real(w[i]) * real(w[i]);
+        energy += 0.5 * si(arm_inertia(&ARM, &t, (enum joint)i, THETA)) * real(w[i]) * real(w[i]);
     }
     return energy;
 }
@@ -248,7 +262,7 @@ static void test_energy_appears_or_vanishes(void)
         motion(time, q, w, a);
         double power = 0;
         for (uint8_t i = 0; i < JOINTS; i++) {
-            power += real(w[i]) * real(torque(&ARM, q[WRIST], (enum joint)i, w, a, theta));
+            power += real(w[i]) * si(torque(&ARM, q[WRIST], (enum joint)i, w, a, theta));
         }
         const double E[4] = {energy_at(time - 2 * STEP_S), energy_at(time - STEP_S), energy_at(time + STEP_S),
                              energy_at(time + 2 * STEP_S)};
@@ -264,16 +278,15 @@ static void test_friction_drives_instead_of_braking(void)
     weightless.g = SCALAR(0);
     static const scalar none[JOINTS] = {SCALAR(0), SCALAR(0)};
     scalar theta[THETA_M] = {SCALAR(0)};
-    theta[FV1] = SCALAR(12);
-    theta[FC1] = SCALAR(6);
-    theta[FV2] = SCALAR(4);
-    theta[FC2] = SCALAR(2);
+    theta[FV1] = OVER_BASE(12);
+    theta[FC1] = OVER_BASE(6);
+    theta[FV2] = OVER_BASE(4);
+    theta[FC2] = OVER_BASE(2);
     weightless.I1 = SCALAR(0);
     const scalar w[JOINTS] = {SCALAR(0.5), SCALAR(-0.5)};
-    const double s = 2 / PI_REAL * atan(450.0);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 6 + 6 * s, real(torque(&weightless, SCALAR(0.2), SWING, w, none, theta)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-4, -2 - 2 * s,
-                              real(torque(&weightless, SCALAR(0.2), WRIST, w, none, theta)));
+    const double s = smooth_sign(w[SWING]);
+    TEST_ASSERT_DOUBLE_WITHIN(1e-4, 6 + 6 * s, si(torque(&weightless, SCALAR(0.2), SWING, w, none, theta)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-4, -2 - 2 * s, si(torque(&weightless, SCALAR(0.2), WRIST, w, none, theta)));
 }
 
 static void test_friction_sign_taken_of_the_noisy_rate(void)
@@ -285,7 +298,7 @@ static void test_friction_sign_taken_of_the_noisy_rate(void)
     struct arm_row row;
     arm_force(&ARM, &t, SWING, w, SCALAR(0.3), SCALAR(1), &row);
     TEST_ASSERT_TRUE(row.phi[COL_FV] == w[SWING]);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 2 / PI_REAL * atan(270.0), real(row.phi[COL_FC]));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-6, smooth_sign(SCALAR(0.3)), real(row.phi[COL_FC]));
 }
 
 static void test_friction_of_the_cylinder_acts_at_the_joint(void)
@@ -318,11 +331,11 @@ static void test_smooth_sign_not_a_sign(void)
      * */
     scalar before = SCALAR(-1);
     for (double w = -3; w <= 3; w += 1e-3) {
-        const scalar s = coulomb_sign(&ARM, SCALAR(w));
+        const scalar s = coulomb_sign(&ARM, from_real(w));
         TEST_ASSERT_TRUE(s >= before);
         TEST_ASSERT_TRUE(absolute(s) < SCALAR(1));
-        TEST_ASSERT_TRUE(coulomb_sign(&ARM, SCALAR(-w)) == -s);
-        TEST_ASSERT_DOUBLE_WITHIN(1e-6, 2 / PI_REAL * atan(900 * w), real(s));
+        TEST_ASSERT_TRUE(coulomb_sign(&ARM, from_real(-w)) == -s);
+        TEST_ASSERT_DOUBLE_WITHIN(1e-6, smooth_sign(from_real(w)), real(s));
         before = s;
     }
     TEST_ASSERT_TRUE(coulomb_sign(&ARM, SCALAR(0)) == SCALAR(0));
@@ -335,10 +348,10 @@ static void test_torque_offset_counted_with_the_wrong_sign(void)
      * joint has its own */
     static const scalar still[JOINTS] = {SCALAR(0), SCALAR(0)};
     scalar theta[THETA_M] = {SCALAR(0)};
-    theta[OM1] = SCALAR(3);
-    theta[OM2] = SCALAR(-0.7);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, -3, real(torque(&ARM, SCALAR(0.2), SWING, still, still, theta)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0.7, real(torque(&ARM, SCALAR(0.2), WRIST, still, still, theta)));
+    theta[OM1] = OVER_BASE(3);
+    theta[OM2] = OVER_BASE(-0.7);
+    TEST_ASSERT_DOUBLE_WITHIN(1e-6, -3, si(torque(&ARM, SCALAR(0.2), SWING, still, still, theta)));
+    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0.7, si(torque(&ARM, SCALAR(0.2), WRIST, still, still, theta)));
 }
 
 int main(void)

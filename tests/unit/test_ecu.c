@@ -202,6 +202,15 @@ static const struct can_frame_11bit *sent(uint32_t id)
     return NULL;
 }
 
+static unsigned count_sent(uint32_t id)
+{
+    unsigned count = 0;
+    for (unsigned k = 0; k < bus.sent_count; k++) {
+        count += bus.sent[k].id == id ? 1u : 0u;
+    }
+    return count;
+}
+
 /* The next frame with this id, within 40 ticks; page: value of its multiplexer at `start`, or -1. */
 static const uint8_t *wait_for(uint32_t id, unsigned start, unsigned length, int page)
 {
@@ -435,6 +444,12 @@ static void test_estimate_or_tracking_frame_wrong(void)
     }
 }
 
+/* What one step of fixed point is in raw steps of a signal, rounded up; 0 for the others, which have more digits. */
+static int32_t raw_steps(int base_log2, double raw_step)
+{
+    return (int32_t)ceil(BY_TYPE(0, 0, 1) * ldexp(STEP, base_log2) / raw_step);
+}
+
 static void test_parameter_frame_of_another_unit(void)
 {
     /* GIVEN an estimator at its priors WHEN all 14 parameter frames have come THEN the priors of the image,
@@ -465,29 +480,36 @@ static void test_parameter_frame_of_another_unit(void)
         TEST_ASSERT_EQUAL_UINT(n, k);
         char name[80];
         (void)snprintf(name, sizeof name, "estimator.prior.%s.value", theta[k].name);
-        TEST_ASSERT_INT32_WITHIN_MESSAGE(1, (int32_t)lround(default_value(name) / theta[k].step),
+        const int base = k < THETA_M    ? base_torque(&ecu.bases)
+                         : k == THETA_M ? -ecu.bases.pressure
+                                        : base_volume(&ecu.bases);
+        TEST_ASSERT_INT32_WITHIN_MESSAGE(1 + raw_steps(base, theta[k].step),
+                                         (int32_t)lround(default_value(name) / theta[k].step),
                                          get_signed(frame, 24, 24), name);
         (void)snprintf(name, sizeof name, "estimator.prior.%s.sd", theta[k].name);
         const double sd = default_value(name) / theta[k].sd_step;
-        TEST_ASSERT_INT32_WITHIN_MESSAGE(1, (int32_t)lround(fmin(sd, 65535)),
-                                         (int32_t)get_bits(frame, 48, 16), name);
+        TEST_ASSERT_INT32_WITHIN_MESSAGE(1 + raw_steps(base, theta[k].sd_step),
+                                         (int32_t)lround(fmin(sd, 65535)), (int32_t)get_bits(frame, 48, 16),
+                                         name);
     }
 }
 
 static void test_parameter_frame_wrong_on_a_large_machine(void)
 {
-    /* GIVEN the largest torque base that an image may have, 2^17 WHEN its inertia J is sent THEN J, in 1e-5
+    /* GIVEN the largest torque base that an image may have, 2^14 WHEN its inertia J is sent THEN J, in 1e-5
      * kg m^2 */
     struct parameter_image image = default_parameter_image;
     uint16_t entry;
-    image.bytes[8] = 24;
+    image.bytes[8] = 22;
     image.bytes[9] = (uint8_t)-6;
-    image.bytes[10] = (uint8_t)-1;
+    image.bytes[10] = (uint8_t)-2;
     image_seal(&image);
     TEST_ASSERT_EQUAL_INT(ECU_OK, ecu_init(&ecu, &image, 1000, &entry));
     ecu.next_parameter = J;
     const struct can_frame_11bit frame = transmit_parameter(&ecu);
-    TEST_ASSERT_INT32_WITHIN(1, (int32_t)lround(default_value("estimator.prior.J_kgm2.value") * 1e5),
+    const double J_kgm2 = default_value("estimator.prior.J_kgm2.value");
+    TEST_ASSERT_EQUAL_INT(BASE_TORQUE_HIGH, base_torque(&ecu.bases));
+    TEST_ASSERT_INT32_WITHIN(1 + raw_steps(BASE_TORQUE_HIGH, 1e-5), (int32_t)lround(J_kgm2 * 1e5),
                              get_signed(frame.data, 24, 24));
 }
 
@@ -649,8 +671,9 @@ static void test_run_wins_over_a_network_stop(void)
 
 static void test_network_stop_leaves_the_arm_running(void)
 {
-    /* GIVEN RUN WHEN the network is stopped, or brought to pre-operational THEN STANDBY, no process frames,
-     * the state in the heartbeat; started again it does not run by itself */
+    /* GIVEN RUN WHEN the network is stopped, or brought to pre-operational THEN STANDBY, one last frame that
+     * shuts the valves and no process frames after it, the state in the heartbeat; started again it does not run
+     * by itself */
     static const uint8_t stops[] = {NMT_STOP, NMT_PRE_OP};
     static const enum nmt_state states[] = {NMT_STOPPED, NMT_PRE_OPERATIONAL};
     for (unsigned n = 0; n < COUNT_OF(stops); n++) {
@@ -661,6 +684,8 @@ static void test_network_stop_leaves_the_arm_running(void)
         TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
         TEST_ASSERT_FALSE(ecu.controller.armed);
         TEST_ASSERT_EQUAL_INT(states[n], ecu.nmt);
+        TEST_ASSERT_EQUAL_UINT(1, count_sent(0x202));
+        TEST_ASSERT_EQUAL_UINT32(DISABLED, get_bits(sent(0x202)->data, 48, 4));
         unsigned beats = 0;
         for (int k = 0; k < 200; k++) {
             tick();
@@ -677,6 +702,30 @@ static void test_network_stop_leaves_the_arm_running(void)
         ticks(10);
         TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
         TEST_ASSERT_NOT_NULL(sent(0x202));
+    }
+}
+
+static void test_network_leaves_with_the_valves_open(void)
+{
+    /* GIVEN RUN WHEN the node is reset THEN the next tick begins with one frame that shuts the valves, before
+     * boot-up; from STANDBY, where they are shut already, neither a reset nor a stop sends one */
+    to_run(CONTROLLER_DIARC);
+    queue_nmt(NMT_RESET, 1);
+    tick();
+    tick();
+    TEST_ASSERT_EQUAL_UINT(1, count_sent(0x202));
+    TEST_ASSERT_EQUAL_HEX32(0x202, bus.sent[0].id);
+    TEST_ASSERT_EQUAL_UINT32(DISABLED, get_bits(bus.sent[0].data, 52, 4));
+    TEST_ASSERT_EQUAL_HEX32(0x701, bus.sent[1].id);
+    static const uint8_t commands[] = {NMT_RESET, NMT_STOP};
+    for (unsigned n = 0; n < COUNT_OF(commands); n++) {
+        setUp();
+        to_standby();
+        queue_nmt(commands[n], 1);
+        tick();
+        TEST_ASSERT_EQUAL_UINT(commands[n] == NMT_RESET ? 1u : 0u, count_sent(0x202));
+        tick();
+        TEST_ASSERT_NULL(sent(0x202));
     }
 }
 
@@ -730,8 +779,9 @@ static unsigned story(struct can_frame_11bit *log)
 
 static void test_something_survives_a_reset(void)
 {
-    /* GIVEN a story of requests, moves and lost frames WHEN the node is reset by NMT and the story is told
-     * again THEN every frame is the same, bit for bit, boot-up and SYNC 1 first */
+    /* GIVEN a story of requests, moves and lost frames that ends in RUN WHEN the node is reset by NMT and the
+     * story is told again THEN one frame shuts the valves, and then every frame is the same, bit for bit, boot-up
+     * and SYNC 1 first */
     static struct can_frame_11bit first[QUEUE];
     static struct can_frame_11bit again[QUEUE];
     static const uint8_t resets[] = {NMT_RESET, NMT_RESET_COMMUNICATION};
@@ -741,12 +791,15 @@ static void test_something_survives_a_reset(void)
         queue_nmt(resets[n], 1);
         tick();
         memset(again, 0, sizeof again);
-        TEST_ASSERT_EQUAL_UINT(count, story(again));
-        TEST_ASSERT_EQUAL_HEX32(0x701, again[0].id);
-        TEST_ASSERT_EQUAL_UINT8(1, again[1].data[0]);
+        TEST_ASSERT_EQUAL_UINT(count + 1, story(again));
+        TEST_ASSERT_EQUAL_HEX32(0x202, again[0].id);
+        TEST_ASSERT_EQUAL_UINT32(MODE_STANDBY,
+                                 get_bits(again[0].data, 12, 4)); /* watch_valves does the rest */
+        TEST_ASSERT_EQUAL_HEX32(0x701, again[1].id);
+        TEST_ASSERT_EQUAL_UINT8(1, again[2].data[0]);
         for (unsigned k = 0; k < count; k++) {
-            TEST_ASSERT_EQUAL_HEX32(first[k].id, again[k].id);
-            TEST_ASSERT_EQUAL_HEX8_ARRAY(first[k].data, again[k].data, 8);
+            TEST_ASSERT_EQUAL_HEX32(first[k].id, again[k + 1].id);
+            TEST_ASSERT_EQUAL_HEX8_ARRAY(first[k].data, again[k + 1].data, 8);
         }
     }
 }
@@ -1159,6 +1212,30 @@ static void test_tare_with_the_pump_on(void)
     }
 }
 
+static void test_refused_tare_forgets_the_last_good_one(void)
+{
+    /* GIVEN a good tare WHEN one with the pump on is refused, or another is broken off THEN the offsets of the
+     * good one stay, all of them */
+    to_standby();
+    depressurise(40, -80);
+    queue_request(REQUEST_TARE, 0, 0, 0, 1);
+    ticks(100);
+    const struct tare good = ecu.tare;
+    TEST_ASSERT_DOUBLE_WITHIN(32, 0.2e5, offset_Pa(SWING, BORE));
+    sensors.pressure[WRIST][ANNULUS] = 600 + 1002;
+    queue_request(REQUEST_TARE, 0, 0, 0, 1);
+    ticks(100);
+    TEST_ASSERT_EQUAL_INT(REFUSAL_NOT_DEPRESSURISED, ecu.counters.last_refusal);
+    TEST_ASSERT_EQUAL_MEMORY(good.offset, ecu.tare.offset, sizeof good.offset);
+    depressurise(0, 0);
+    queue_request(REQUEST_TARE, 0, 0, 0, 1);
+    ticks(50);
+    queue_request(REQUEST_STANDBY, 0, 0, 0, 1);
+    tick();
+    TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
+    TEST_ASSERT_EQUAL_MEMORY(good.offset, ecu.tare.offset, sizeof good.offset);
+}
+
 static void test_tare_cannot_be_left(void)
 {
     /* GIVEN a tare under way WHEN STANDBY is asked for, the network is stopped or the sensors are gone THEN
@@ -1300,6 +1377,7 @@ int main(void)
     RUN_TEST(test_run_wins_over_a_later_standby);
     RUN_TEST(test_run_wins_over_a_network_stop);
     RUN_TEST(test_network_stop_leaves_the_arm_running);
+    RUN_TEST(test_network_leaves_with_the_valves_open);
     RUN_TEST(test_network_command_for_another_node_obeyed);
     RUN_TEST(test_something_survives_a_reset);
     RUN_TEST(test_shutdown_leaves_the_valves_open);
@@ -1318,6 +1396,7 @@ int main(void)
     RUN_TEST(test_repeated_request_carried_out_twice);
     RUN_TEST(test_tare_finds_another_zero);
     RUN_TEST(test_tare_with_the_pump_on);
+    RUN_TEST(test_refused_tare_forgets_the_last_good_one);
     RUN_TEST(test_tare_cannot_be_left);
     RUN_TEST(test_tare_counts_samples_that_did_not_come);
     RUN_TEST(test_full_send_queue_changes_what_the_ecu_does);

@@ -5,15 +5,10 @@
 #include "testing.h"
 
 /* Load in kg; compliance relative; flow offsets in m^3/s. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define LOAD_KG 5e-5
-#define COMPLIANCE 2e-3
-#define OFFSET_M3_S 3e-9
-#else
-#define LOAD_KG 2e-4
-#define COMPLIANCE 5e-3
-#define OFFSET_M3_S 3e-8
-#endif
+#define LOAD_KG BY_TYPE(5e-5, 2e-4, 1.5e-4)
+#define COMPLIANCE BY_TYPE(2e-3, 5e-3, 2e-3)
+#define OFFSET_M3_S BY_TYPE(3e-9, 3e-8, 3e-9)
+#define PER_TICK BY_TYPE(1e-15, 2e-7, 1e-6) /* relative */
 
 enum { TICKS_PER_S = 1000, PERIOD_TICKS = 4000, MOVE_TICKS = 1500, REST_TICKS = 500 };
 
@@ -39,7 +34,7 @@ static int torque_base;
 
 static void restart_estimator(void)
 {
-    constants = estimator_constants(parameters, SCALAR(DT_S));
+    constants = estimator_constants(parameters, from_real(DT_S));
     estimator_start(&estimator, parameters, &constants);
 }
 
@@ -185,11 +180,11 @@ static struct estimator_sample sample_at(uint32_t k)
     const struct motion before = motion_at(t == 0 ? 0 : t - 1);
     struct estimator_sample sample;
     memset(&sample, 0, sizeof sample);
-    sample.trig = wrist_trig(&machine.arm, SCALAR(now.q[WRIST]));
+    sample.trig = wrist_trig(&machine.arm, from_real(now.q[WRIST]));
     for (uint8_t i = 0; i < JOINTS; i++) {
-        sample.dq[i] = SCALAR(now.q[i] - before.q[i]);
-        sample.reference_w[i] = SCALAR(now.w[i]);
-        sample.cylinder[i] = cylinder_at(&machine.cylinder[i], &cylinders[i], SCALAR(now.q[i]));
+        sample.dq[i] = from_real(now.q[i] - before.q[i]);
+        sample.reference_w[i] = from_real(now.w[i]);
+        sample.cylinder[i] = cylinder_at(&machine.cylinder[i], &cylinders[i], from_real(now.q[i]));
         sample.lever[i] = SCALAR(1);
         sample.force[i] = per_unit(force_N(t, i), bases.pressure + bases.area);
         /* Eq 6 solved for QL, less leakage */
@@ -243,6 +238,20 @@ static void test_load_found_too_late(void)
     plant.load_kg = 7.5;
     run(0, 400);
     TEST_ASSERT_DOUBLE_WITHIN(0.1, 7.5, load_kg());
+}
+
+static void test_rates_wrong_at_the_shortest_or_the_longest_period(void)
+{
+    /* GIVEN the periods that the ECU takes, 250 us to 20 ms WHEN the constants are worked out THEN what divides by
+     * the period divides by it */
+    static const double periods_s[] = {250e-6, 400e-6, 500e-6, 1e-3, 20e-3};
+    for (unsigned n = 0; n < COUNT_OF(periods_s); n++) {
+        const scalar dt_s = from_real(periods_s[n]);
+        const struct estimator_constants c = estimator_constants(parameters, dt_s);
+        TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_tick) * real(dt_s));
+        TEST_ASSERT_DOUBLE_WITHIN(PER_TICK * real(c.filter), real(c.filter),
+                                  real_gain(c.filter_rate) * real(dt_s));
+    }
 }
 
 static void test_friction_of_the_cylinder_not_learned(void)
@@ -376,7 +385,7 @@ static void test_gap_in_the_samples_biases_the_load(void)
     const struct motion next = motion_at(737);
     struct estimator_sample after = sample_at(737);
     for (uint8_t i = 0; i < JOINTS; i++) {
-        after.dq[i] = SCALAR(next.q[i] - last.q[i]);
+        after.dq[i] = from_real(next.q[i] - last.q[i]);
     }
     estimator_resume(&estimator);
     TEST_ASSERT_FALSE(estimator.updating);
@@ -420,7 +429,7 @@ static void test_wrong_valve_gain_taken_for_compressibility(void)
     double off[2];
     for (int told = 0; told < 2; told++) {
         parameters->h[BETA_INVERSE].sd = per_unit(5e-10, -bases.pressure);
-        parameters->flow_error = SCALAR(0.02 * told);
+        parameters->flow_error = from_real(0.02 * told);
         restart_estimator();
         for (uint32_t k = 0; k < 3 * PERIOD_TICKS; k++) {
             struct estimator_sample sample = sample_at(k);
@@ -472,7 +481,7 @@ static struct estimator_sample steady_turn(void)
     const uint32_t rest = MOVE_TICKS + REST_TICKS - 1;
     const double torque_Nm = 12 * 0.3 + 6 * 2 / PI_REAL * atan(900 * 0.3);
     struct estimator_sample sample = sample_at(rest);
-    sample.dq[SWING] = SCALAR(0.3 * DT_S);
+    sample.dq[SWING] = from_real(0.3 * DT_S);
     sample.reference_w[SWING] = SCALAR(0.3);
     sample.force[SWING] = per_unit(torque_Nm / lever_arm_m(rest, SWING), bases.pressure + bases.area);
     return sample;
@@ -555,6 +564,7 @@ int main(void)
     UNITY_BEGIN();
     RUN_TEST(test_load_biased_by_the_estimator_itself);
     RUN_TEST(test_load_found_too_late);
+    RUN_TEST(test_rates_wrong_at_the_shortest_or_the_longest_period);
     RUN_TEST(test_friction_of_the_cylinder_not_learned);
     RUN_TEST(test_friction_at_rest_taken_for_load);
     RUN_TEST(test_estimate_drifts_at_rest);

@@ -3,15 +3,9 @@
 #include "testing.h"
 
 /* Relative. The image holds binary32 numbers, so no result is better than that. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define TOLERANCE 4e-7
-#define SLOPE_TOLERANCE 1e-7
-#define STEP_RAD 1e-2
-#else
-#define TOLERANCE 2e-6
-#define SLOPE_TOLERANCE 3e-5
-#define STEP_RAD 3e-2
-#endif
+#define TOLERANCE BY_TYPE(4e-7, 2e-6, 1.5e-6)
+#define SLOPE_TOLERANCE BY_TYPE(1e-7, 3e-5, 4e-6)
+#define STEP_RAD BY_TYPE(1e-2, 3e-2, 3e-2)
 
 static struct machine machine;
 static struct bases bases;
@@ -50,6 +44,13 @@ static void expect_relative(double expected, double actual)
     TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * fabs(expected), expected, actual);
 }
 
+/* A parameter as the type can hold it. */
+static void expect_parameter(double expected, scalar x, int base_log2)
+{
+    const double step = BY_TYPE(0, 0, ldexp(STEP, base_log2 - 1));
+    TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * fabs(expected) + step, expected, si_of(x, base_log2));
+}
+
 static double area_m2(uint8_t joint, enum chamber chamber)
 {
     const double rod = chamber == ANNULUS ? ROD_M[joint] : 0;
@@ -75,7 +76,7 @@ static double volume_m3(uint8_t joint, enum chamber chamber, double q)
 
 static struct cylinder_state state_at(uint8_t joint, double q)
 {
-    return cylinder_at(&machine.cylinder[joint], &constants[joint], SCALAR(q));
+    return cylinder_at(&machine.cylinder[joint], &constants[joint], from_real(q));
 }
 
 /* lamB or lamC in 1/m */
@@ -93,35 +94,35 @@ static void pressures(scalar p[CHAMBERS], double bore_Pa, double annulus_Pa)
 static void test_reference_arm_is_not_the_one_in_SI(void)
 {
     /* GIVEN the built-in image WHEN brought per unit and back THEN the numbers of the reference arm in SI */
-    expect_relative(9.81, real(machine.arm.g));
-    expect_relative(900, real(machine.arm.coulomb_slope));
-    expect_relative(3.0, si_of(machine.arm.I1, base_torque(&bases)));
-    expect_relative(0.8, real(machine.arm.L1));
-    expect_relative(0.4, real(machine.arm.L2));
-    expect_relative(SUPPLY_PA, si_of(machine.supply.p_supply, pressure_base));
-    expect_relative(TANK_PA, si_of(machine.supply.p_tank, pressure_base));
+    expect_parameter(9.81, machine.arm.g, 0);
+    expect_parameter(1.0 / 900, machine.arm.coulomb_rate, 0);
+    expect_parameter(3.0, machine.arm.I1, base_torque(&bases));
+    expect_parameter(0.8, machine.arm.L1, 0);
+    expect_parameter(0.4, machine.arm.L2, 0);
+    expect_parameter(SUPPLY_PA, machine.supply.p_supply, pressure_base);
+    expect_parameter(TANK_PA, machine.supply.p_tank, pressure_base);
     for (uint8_t i = 0; i < JOINTS; i++) {
         const struct cylinder *const c = &machine.cylinder[i];
-        expect_relative(BORE_M[i], si_of(c->bore, area_base / 2));
-        expect_relative(ROD_M[i], si_of(c->rod, area_base / 2));
-        expect_relative(DEAD_M3[i], si_of(c->dead_volume, volume_base));
-        expect_relative(A_M[i], si_of(c->a, lever_base));
-        expect_relative(B_M[i], si_of(c->b, lever_base));
-        expect_relative(Q0_RAD[i], real(c->q0));
-        expect_relative(-1.0, real(c->q_min));
-        expect_relative(1.2, real(c->q_max));
-        expect_relative(0.01, si_of(c->end_margin, lever_base));
-        expect_relative(KV[i], si_of(c->kv, volume_base - pressure_base / 2));
-        expect_relative(2e-13, si_of(c->leakage, volume_base - pressure_base));
+        expect_parameter(BORE_M[i], c->bore, area_base / 2);
+        expect_parameter(ROD_M[i], c->rod, area_base / 2);
+        expect_parameter(DEAD_M3[i], c->dead_volume, volume_base);
+        expect_parameter(A_M[i], c->a, lever_base);
+        expect_parameter(B_M[i], c->b, lever_base);
+        expect_parameter(Q0_RAD[i], c->q0, 0);
+        expect_parameter(-1.0, c->q_min, 0);
+        expect_parameter(1.2, c->q_max, 0);
+        expect_parameter(0.01, c->end_margin, lever_base);
+        expect_parameter(KV[i], c->kv, volume_base - pressure_base / 2);
+        expect_parameter(2e-13, c->leakage, volume_base - pressure_base);
     }
     const struct estimator_parameters *const e = &machine.estimator;
-    expect_relative(5.0, si_of(e->m[M2].value, base_torque(&bases)));
-    expect_relative(0.8 / 3, si_of(e->m[J].value, base_torque(&bases)));
-    expect_relative(12, si_of(e->m[FV1].value, base_torque(&bases)));
-    expect_relative(4, si_of(e->m[FV2].value, base_torque(&bases)));
-    expect_relative(6, si_of(e->m[FC1].value, base_torque(&bases)));
-    expect_relative(2, si_of(e->m[FC2].value, base_torque(&bases)));
-    expect_relative(1e-9, si_of(e->h[BETA_INVERSE].value, -pressure_base));
+    expect_parameter(5.0, e->m[M2].value, base_torque(&bases));
+    expect_parameter(0.8 / 3, e->m[J].value, base_torque(&bases));
+    expect_parameter(12, e->m[FV1].value, base_torque(&bases));
+    expect_parameter(4, e->m[FV2].value, base_torque(&bases));
+    expect_parameter(6, e->m[FC1].value, base_torque(&bases));
+    expect_parameter(2, e->m[FC2].value, base_torque(&bases));
+    expect_parameter(1e-9, e->h[BETA_INVERSE].value, -pressure_base);
 }
 
 static void test_constants_of_the_cylinders_wrong(void)
@@ -290,10 +291,10 @@ static void test_overlap_not_made_up_for(void)
     static const double overlaps[] = {0, 0.02, 0.2};
     for (unsigned n = 0; n < COUNT_OF(overlaps); n++) {
         struct cylinder cylinder = machine.cylinder[WRIST];
-        cylinder.overlap = SCALAR(overlaps[n]);
+        cylinder.overlap = from_real(overlaps[n]);
         double before = real(valve_spool(&cylinder, SCALAR(-0.8)));
         for (double opening = -0.8; opening <= 0.8; opening += 1e-4) {
-            const scalar spool = valve_spool(&cylinder, SCALAR(opening));
+            const scalar spool = valve_spool(&cylinder, from_real(opening));
             if (fabs(opening) > 0.006) {
                 TEST_ASSERT_DOUBLE_WITHIN(1e-6, opening, real(valve_opening(&cylinder, spool)));
             }

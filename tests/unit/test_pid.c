@@ -3,11 +3,7 @@
 #include "testing.h"
 
 /* Of a spool, -1..1. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define TOLERANCE 1e-12
-#else
-#define TOLERANCE 1e-5
-#endif
+#define TOLERANCE BY_TYPE(1e-12, 1e-5, 2e-6)
 
 static const double DT_S = 1e-3;
 static const struct pid_gains GAINS = {.kp = GAIN(8), .ki = GAIN(10), .kd = GAIN(0.1)};
@@ -25,7 +21,7 @@ void tearDown(void)
 
 static double step(double e1, double rate)
 {
-    return real(pid_step(&pid, &GAINS, SCALAR(e1), SCALAR(rate), SCALAR(DT_S)));
+    return real(pid_step(&pid, &GAINS, from_real(e1), from_real(rate), from_real(DT_S)));
 }
 
 static void test_error_driven_further(void)

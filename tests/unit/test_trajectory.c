@@ -1,19 +1,14 @@
 /* Point-to-point moves (control/trajectory): 0.6 rad in 1.5 s at 1 kHz, as in the paper's benchmark. */
-#include <float.h>
-
 #include "control/trajectory.h"
 #include "testing.h"
 
 /* Of angles of order one; rates and accelerations are checked numerically over SPAN ticks. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define ULP DBL_EPSILON
-#define TOLERANCE 1e-13
-#define SLOPE_TOLERANCE 2e-6
-#else
-#define ULP ((double)FLT_EPSILON)
-#define TOLERANCE 1e-5
-#define SLOPE_TOLERANCE 3e-4
-#endif
+#define TOLERANCE BY_TYPE(1e-13, 1e-5, 1e-5)
+#define SLOPE_TOLERANCE BY_TYPE(2e-6, 3e-4, 2e-4)
+#define LONG_MOVE BY_TYPE(1e-4, 1e-4, 1e-3) /* relative, of the greatest rate */
+
+/* So many ticks before the end the rate is still more than the type's step. */
+#define LAST_MOVING BY_TYPE(1, 1, 5)
 
 enum { TICKS = 1500, SPAN = 10 };
 
@@ -28,7 +23,7 @@ static struct reference samples[TICKS + 1];
 
 void setUp(void)
 {
-    trajectory = trajectory_at_rest(SCALAR(START_RAD));
+    trajectory = trajectory_at_rest(from_real(START_RAD));
 }
 
 void tearDown(void)
@@ -37,7 +32,7 @@ void tearDown(void)
 
 static bool begin(void)
 {
-    return trajectory_start(&trajectory, SCALAR(TARGET_RAD), TICKS, SCALAR(DT_S));
+    return trajectory_start(&trajectory, from_real(TARGET_RAD), TICKS, from_real(DT_S));
 }
 
 /* The whole move, both ends included. */
@@ -55,7 +50,7 @@ static void test_move_does_not_begin_at_rest(void)
     /* GIVEN rest WHEN a move starts THEN its first sample is the start, exactly and without rate */
     TEST_ASSERT_TRUE(begin());
     const struct reference first = trajectory_now(&trajectory);
-    TEST_ASSERT_TRUE(first.q == SCALAR(START_RAD));
+    TEST_ASSERT_TRUE(first.q == from_real(START_RAD));
     TEST_ASSERT_TRUE(first.w == SCALAR(0));
     TEST_ASSERT_TRUE(first.a == SCALAR(0));
 }
@@ -65,10 +60,17 @@ static void test_move_does_not_end_at_rest_at_its_target(void)
     /* GIVEN a move WHEN its last tick has passed THEN it rests at the target, after that many ticks, not one
      * less */
     record();
-    TEST_ASSERT_DOUBLE_WITHIN(ULP, TARGET_RAD, real(samples[TICKS].q));
+    TEST_ASSERT_DOUBLE_WITHIN(STEP, TARGET_RAD, real(samples[TICKS].q));
     TEST_ASSERT_TRUE(samples[TICKS].w == SCALAR(0));
     TEST_ASSERT_TRUE(samples[TICKS].a == SCALAR(0));
-    TEST_ASSERT_TRUE(samples[TICKS - 1].w > SCALAR(0));
+    TEST_ASSERT_TRUE(samples[TICKS - LAST_MOVING].w > SCALAR(0));
+    TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
+    setUp();
+    TEST_ASSERT_TRUE(begin());
+    for (int k = 0; k < TICKS; k++) {
+        TEST_ASSERT_TRUE(trajectory_moving(&trajectory));
+        trajectory_advance(&trajectory);
+    }
     TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
 }
 
@@ -78,13 +80,13 @@ static void test_end_point_creeps_away_over_many_moves(void)
      * */
     struct lcg noise = {3};
     for (int n = 0; n < 1000; n++) {
-        const scalar target = SCALAR(lcg_uniform(&noise, -1, 1.2));
-        TEST_ASSERT_TRUE(trajectory_start(&trajectory, target, 7, SCALAR(DT_S)));
+        const scalar target = from_real(lcg_uniform(&noise, -1, 1.2));
+        TEST_ASSERT_TRUE(trajectory_start(&trajectory, target, 7, from_real(DT_S)));
         for (int k = 0; k < 7; k++) {
             trajectory_advance(&trajectory);
         }
         TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
-        TEST_ASSERT_DOUBLE_WITHIN(2 * ULP, real(target), real(trajectory_now(&trajectory).q));
+        TEST_ASSERT_DOUBLE_WITHIN(2 * STEP, real(target), real(trajectory_now(&trajectory).q));
     }
 }
 
@@ -146,7 +148,7 @@ static void test_new_target_takes_over_half_way(void)
         trajectory_advance(&trajectory);
     }
     const struct trajectory before = trajectory;
-    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(-0.9), 100, SCALAR(DT_S)));
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(-0.9), 100, from_real(DT_S)));
     TEST_ASSERT_EQUAL_MEMORY(&before, &trajectory, sizeof before);
     TEST_ASSERT_TRUE(trajectory_moving(&trajectory));
 }
@@ -155,10 +157,10 @@ static void test_move_in_no_time_jumps(void)
 {
     /* GIVEN rest WHEN a move of 0 ticks, or of more than can be counted, is asked for THEN refused, still at
      * rest */
-    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(TARGET_RAD), 0, SCALAR(DT_S)));
-    TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(TARGET_RAD), UINT32_MAX, SCALAR(DT_S)));
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, from_real(TARGET_RAD), 0, from_real(DT_S)));
+    TEST_ASSERT_FALSE(trajectory_start(&trajectory, from_real(TARGET_RAD), UINT32_MAX, from_real(DT_S)));
     TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
-    TEST_ASSERT_TRUE(trajectory_now(&trajectory).q == SCALAR(START_RAD));
+    TEST_ASSERT_TRUE(trajectory_now(&trajectory).q == from_real(START_RAD));
 }
 
 static void test_rest_drifts(void)
@@ -171,9 +173,28 @@ static void test_rest_drifts(void)
         const struct reference now = trajectory_now(&trajectory);
         TEST_ASSERT_TRUE(now.q == end.q && now.w == SCALAR(0) && now.a == SCALAR(0));
     }
-    TEST_ASSERT_TRUE(trajectory_start(&trajectory, SCALAR(START_RAD), 1, SCALAR(DT_S)));
+    TEST_ASSERT_TRUE(trajectory_start(&trajectory, from_real(START_RAD), 1, from_real(DT_S)));
     trajectory_advance(&trajectory);
-    TEST_ASSERT_DOUBLE_WITHIN(ULP, START_RAD, real(trajectory_now(&trajectory).q));
+    TEST_ASSERT_DOUBLE_WITHIN(STEP, START_RAD, real(trajectory_now(&trajectory).q));
+}
+
+static void test_rate_of_a_long_move_is_not_the_mean_times_its_profile(void)
+{
+    /* GIVEN the shortest and the longest moves that a request may ask for, at the shortest and at the longest
+     * period WHEN half over THEN rate and duration belong together */
+    static const struct {
+        double dt_s, duration_s;
+    } moves[] = {{250e-6, 65.535}, {250e-6, 50.0}, {1e-3, 65.535},
+                 {1e-3, 60.0},     {20e-3, 65.52}, {250e-6, 0.5}};
+    for (unsigned n = 0; n < COUNT_OF(moves); n++) {
+        setUp();
+        const uint32_t ticks = (uint32_t)lround(moves[n].duration_s / moves[n].dt_s);
+        TEST_ASSERT_TRUE(
+            trajectory_start(&trajectory, from_real(TARGET_RAD), ticks, from_real(moves[n].dt_s)));
+        trajectory.tick = ticks / 2;
+        const double expected = 140.0 / 64 * DISTANCE_RAD / moves[n].duration_s;
+        TEST_ASSERT_DOUBLE_WITHIN(LONG_MOVE * expected, expected, real(trajectory_now(&trajectory).w));
+    }
 }
 
 int main(void)
@@ -188,5 +209,6 @@ int main(void)
     RUN_TEST(test_new_target_takes_over_half_way);
     RUN_TEST(test_move_in_no_time_jumps);
     RUN_TEST(test_rest_drifts);
+    RUN_TEST(test_rate_of_a_long_move_is_not_the_mean_times_its_profile);
     return UNITY_END();
 }

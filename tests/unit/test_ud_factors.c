@@ -2,12 +2,12 @@
 #include "control/ud_factors.h"
 #include "testing.h"
 
-/* Of variances and gains of order one, over some hundred updates. */
-#if defined(DIARC_SCALAR_DOUBLE)
-#define TOLERANCE 1e-10
-#else
-#define TOLERANCE 2e-4
-#endif
+/* Of gains of order one, and of variances over the noise's, over some hundred updates. */
+#define TOLERANCE BY_TYPE(1e-10, 2e-4, 1.5e-5)
+/* The same of one update. */
+#define ONE_UPDATE BY_TYPE(1e-15, 1e-6, 3e-6)
+/* Decades that a prior may be above the noise; fixed point's K = sqrt(D / noise) / 2 ends at 2048. */
+#define DECADES BY_TYPE(10, 10, 3.6)
 
 enum { SIZE = UD_SIZE_MAX };
 
@@ -24,13 +24,13 @@ void tearDown(void)
 {
 }
 
-static void start(uint8_t size, const double variance[])
+static void start(uint8_t size, const double prior[])
 {
-    scalar v[SIZE] = {0};
+    variance v[SIZE] = {0};
     memset(P, 0, sizeof P);
     for (uint8_t k = 0; k < size; k++) {
-        v[k] = SCALAR(variance[k]);
-        P[k][k] = real(v[k]);
+        v[k] = variance_from_real(prior[k]);
+        P[k][k] = real_variance(v[k]);
     }
     ud_start(&ud, size, v);
 }
@@ -38,15 +38,15 @@ static void start(uint8_t size, const double variance[])
 static void random_row(uint8_t size, double amplitude, scalar phi[SIZE])
 {
     for (uint8_t k = 0; k < size; k++) {
-        phi[k] = SCALAR(lcg_uniform(&noise, -amplitude, amplitude));
+        phi[k] = from_real(lcg_uniform(&noise, -amplitude, amplitude));
     }
 }
 
-/* P - K phi'P, K = P phi / (1 + phi'P phi) */
-static double covariance_update(uint8_t size, const scalar phi[SIZE], double K[SIZE])
+/* P - K phi'P, K = P phi / (noise + phi'P phi) */
+static double covariance_update(uint8_t size, const scalar phi[SIZE], variance noise_variance, double K[SIZE])
 {
     double P_phi[SIZE] = {0};
-    double alpha = 1;
+    double alpha = real_variance(noise_variance);
     for (uint8_t i = 0; i < size; i++) {
         for (uint8_t j = 0; j < size; j++) {
             P_phi[i] += P[i][j] * real(phi[j]);
@@ -69,52 +69,56 @@ static double product(uint8_t i, uint8_t j)
     for (uint8_t k = i > j ? i : j; k < ud.size; k++) {
         const double Uik = i == k ? 1 : real(ud.U[k * (k - 1) / 2 + i]);
         const double Ujk = j == k ? 1 : real(ud.U[k * (k - 1) / 2 + j]);
-        sum += Uik * real(ud.D[k]) * Ujk;
+        sum += Uik * real_variance(ud.D[k]) * Ujk;
     }
     return sum;
 }
 
-static void expect_covariance(void)
+static void expect_covariance(double most)
 {
     for (uint8_t k = 0; k < ud.size; k++) {
-        TEST_ASSERT_TRUE(ud.D[k] >= SCALAR(0)); /* false for NaN too */
-        TEST_ASSERT_TRUE(ud.D[k] <= SCALAR(1e6));
+        TEST_ASSERT_TRUE(real_variance(ud.D[k]) >= 0); /* false for NaN too */
+        TEST_ASSERT_TRUE(real_variance(ud.D[k]) <= most);
     }
 }
 
 static void test_one_parameter_by_hand(void)
 {
-    /* GIVEN variance 4 WHEN measured once with phi = 1 THEN innovation 5, gain 0.8, variance 0.8 */
-    const double variance[] = {4};
+    /* GIVEN variance 0.4 WHEN measured once with phi = 1 and a noise of 0.1 THEN innovation 0.5, gain 0.8,
+     * variance 0.08 */
+    const double prior[] = {0.4};
     const scalar phi[SIZE] = {SCALAR(1)};
-    scalar K[SIZE];
-    start(1, variance);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 5, real(ud_update(&ud, phi, K)));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0.8, real(K[0]));
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0.8, real(ud_variance(&ud, 0)));
+    gain K[SIZE];
+    start(1, prior);
+    TEST_ASSERT_DOUBLE_WITHIN(ONE_UPDATE, 0.5, real_variance(ud_update(&ud, phi, VARIANCE(0.1), K)));
+    TEST_ASSERT_DOUBLE_WITHIN(ONE_UPDATE, 0.8, real_gain(K[0]));
+    TEST_ASSERT_DOUBLE_WITHIN(ONE_UPDATE, 0.08, real_variance(ud_variance(&ud, 0)));
 }
 
 static void test_factors_drift_from_the_covariance_form(void)
 {
     /* GIVEN random rows and every size WHEN updated THEN gain, innovation and P are the covariance form's */
+    const double unit = 1.0 / 16;
+    const variance of_noise = VARIANCE(1.0 / 16);
     for (uint8_t size = 1; size <= SIZE; size++) {
-        double variance[SIZE];
+        double prior[SIZE];
         for (uint8_t k = 0; k < size; k++) {
-            variance[k] = lcg_uniform(&noise, 0.1, 2);
+            prior[k] = unit * lcg_uniform(&noise, 0.1, 2);
         }
-        start(size, variance);
+        start(size, prior);
         for (int n = 0; n < 200; n++) {
             scalar phi[SIZE] = {0};
-            scalar K[SIZE];
+            gain K[SIZE];
             double expected_K[SIZE];
             random_row(size, 1, phi);
-            const double alpha = covariance_update(size, phi, expected_K);
-            TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * alpha, alpha, real(ud_update(&ud, phi, K)));
+            const double alpha = covariance_update(size, phi, of_noise, expected_K);
+            TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * alpha, alpha,
+                                      real_variance(ud_update(&ud, phi, of_noise, K)));
             for (uint8_t i = 0; i < size; i++) {
-                TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, expected_K[i], real(K[i]));
-                TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, P[i][i], real(ud_variance(&ud, i)));
+                TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, expected_K[i], real_gain(K[i]));
+                TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * unit, P[i][i], real_variance(ud_variance(&ud, i)));
                 for (uint8_t j = 0; j < size; j++) {
-                    TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE, P[i][j], product(i, j));
+                    TEST_ASSERT_DOUBLE_WITHIN(TOLERANCE * unit, P[i][j], product(i, j));
                 }
             }
         }
@@ -125,25 +129,25 @@ static void test_estimate_does_not_reach_the_truth(void)
 {
     /* GIVEN exact measurements WHEN theta += K (y - phi' theta) THEN theta is found, with little variance */
     static const double truth[] = {0.4, -0.2, 0.7, 0.1, -0.6, 0.3, 0.05, -0.9, 0.5};
-    static const double variance[] = {1, 1, 1, 1, 1, 1, 1, 1, 1};
+    static const double prior[] = {0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2};
     double theta[SIZE] = {0};
-    start(SIZE, variance);
+    start(SIZE, prior);
     for (int n = 0; n < 5000; n++) {
         scalar phi[SIZE];
-        scalar K[SIZE];
-        random_row(SIZE, 3, phi);
+        gain K[SIZE];
+        random_row(SIZE, 0.9, phi);
         double residual = 0;
         for (uint8_t k = 0; k < SIZE; k++) {
             residual += real(phi[k]) * (truth[k] - theta[k]);
         }
-        (void)ud_update(&ud, phi, K);
+        (void)ud_update(&ud, phi, VARIANCE(0.02), K);
         for (uint8_t k = 0; k < SIZE; k++) {
-            theta[k] += real(K[k]) * residual;
+            theta[k] += real_gain(K[k]) * residual;
         }
     }
     for (uint8_t k = 0; k < SIZE; k++) {
         TEST_ASSERT_DOUBLE_WITHIN(1e-3, truth[k], theta[k]);
-        TEST_ASSERT_DOUBLE_WITHIN(1e-4, 0, real(ud_variance(&ud, k)));
+        TEST_ASSERT_DOUBLE_WITHIN(2e-5, 0, real_variance(ud_variance(&ud, k)));
     }
 }
 
@@ -151,18 +155,18 @@ static void test_pinned_parameter_moves(void)
 {
     /* GIVEN one parameter of zero variance, whichever WHEN others learn THEN its gain and variance are 0 */
     for (uint8_t pinned = 0; pinned < SIZE; pinned++) {
-        double variance[SIZE];
+        double prior[SIZE];
         for (uint8_t k = 0; k < SIZE; k++) {
-            variance[k] = k == pinned ? 0 : 1;
+            prior[k] = k == pinned ? 0 : 0.2;
         }
-        start(SIZE, variance);
+        start(SIZE, prior);
         for (int n = 0; n < 300; n++) {
             scalar phi[SIZE];
-            scalar K[SIZE];
-            random_row(SIZE, 5, phi);
-            (void)ud_update(&ud, phi, K);
-            TEST_ASSERT_TRUE(K[pinned] == SCALAR(0));
-            TEST_ASSERT_TRUE(ud_variance(&ud, pinned) == SCALAR(0));
+            gain K[SIZE];
+            random_row(SIZE, 0.9, phi);
+            (void)ud_update(&ud, phi, VARIANCE(0.006), K);
+            TEST_ASSERT_TRUE(K[pinned] == GAIN(0));
+            TEST_ASSERT_TRUE(ud_variance(&ud, pinned) == VARIANCE(0));
         }
     }
 }
@@ -170,13 +174,13 @@ static void test_pinned_parameter_moves(void)
 static void test_walk_of_the_load_spreads_to_others(void)
 {
     /* GIVEN correlated parameters WHEN D[0] grows THEN P(0,0) grows by as much and nothing else moves */
-    static const double variance[] = {1, 0.5, 2, 1, 0.3, 1, 1.5, 1, 0.7};
-    start(SIZE, variance);
+    static const double prior[] = {0.125, 0.0625, 0.25, 0.125, 0.0375, 0.125, 0.1875, 0.125, 0.0875};
+    start(SIZE, prior);
     for (int n = 0; n < 50; n++) {
         scalar phi[SIZE];
-        scalar K[SIZE];
+        gain K[SIZE];
         random_row(SIZE, 0.5, phi);
-        (void)ud_update(&ud, phi, K);
+        (void)ud_update(&ud, phi, VARIANCE(0.125), K);
     }
     double before[SIZE][SIZE];
     for (uint8_t i = 0; i < SIZE; i++) {
@@ -184,59 +188,62 @@ static void test_walk_of_the_load_spreads_to_others(void)
             before[i][j] = product(i, j);
         }
     }
-    TEST_ASSERT_TRUE(fabs(before[0][1]) > 1e-4); /* correlated indeed */
-    const scalar variance_before = ud_variance(&ud, 0);
-    ud.D[0] += SCALAR(0.25);
-    TEST_ASSERT_DOUBLE_WITHIN(1e-6, 0.25, real(ud_variance(&ud, 0) - variance_before));
+    TEST_ASSERT_TRUE(fabs(before[0][1]) > 1e-5); /* correlated indeed */
+    const variance variance_before = ud_variance(&ud, 0);
+    const double walk = 0x1p-5;
+    ud.D[0] += VARIANCE(0x1p-5);
+    TEST_ASSERT_DOUBLE_WITHIN(1e-7, walk, real_variance(ud_variance(&ud, 0) - variance_before));
     for (uint8_t i = 0; i < SIZE; i++) {
         for (uint8_t j = 0; j < SIZE; j++) {
-            TEST_ASSERT_DOUBLE_WITHIN(1e-6, before[i][j] + (i == 0 && j == 0 ? 0.25 : 0), product(i, j));
+            TEST_ASSERT_DOUBLE_WITHIN(1e-7, before[i][j] + (i == 0 && j == 0 ? walk : 0), product(i, j));
         }
     }
 }
 
 static void test_D_turns_negative_on_rows_that_are_alike(void)
 {
-    /* GIVEN rows of any strength that hardly differ, which breaks the covariance form WHEN updated THEN D >=
-     * 0 */
-    static const double variance[] = {1, 1, 1, 1, 1, 1, 1, 1, 1};
+    /* GIVEN rows of any strength over the noise that hardly differ, which breaks the covariance form WHEN
+     * updated THEN 0 <= D <= its prior */
+    static const double prior[] = {0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2};
     for (int n = 0; n < 3000; n++) {
-        const double strength = pow(10, lcg_uniform(&noise, 0, 10));
+        const double strength = pow(10, lcg_uniform(&noise, 0, DECADES));
+        const variance of_noise = variance_from_real(0.2 / (strength * strength));
         scalar direction[SIZE];
-        start(SIZE, variance);
-        random_row(SIZE, strength, direction);
+        start(SIZE, prior);
+        random_row(SIZE, 0.9, direction);
         for (int k = 0; k < 30; k++) {
             scalar phi[SIZE];
-            scalar K[SIZE];
-            random_row(SIZE, strength * 1e-3, phi);
+            gain K[SIZE];
+            random_row(SIZE, 0.9e-3, phi);
             for (uint8_t i = 0; i < SIZE; i++) {
                 phi[i] += direction[i];
             }
-            (void)ud_update(&ud, phi, K);
-            expect_covariance();
+            (void)ud_update(&ud, phi, of_noise, K);
+            expect_covariance(0.2 * (1 + 1e-5));
         }
     }
 }
 
 static void test_long_run_loses_the_covariance(void)
 {
-    /* GIVEN an hour and more of updates, 250 a second, with the load's walk WHEN run THEN P is still one and
-     * the load's variance has settled, not wound up nor died */
-    static const double variance[] = {0.4, 1e-5, 1e-5, 1e-4, 1e-5, 1e-4, 1e-5, 1e-5, 1e-6};
-    const scalar walk = SCALAR(1e-10);
+    /* GIVEN an hour and more of updates, 250 a second, with the load's walk as the estimator adds it, every 50
+     * updates WHEN run THEN P is still one and the load's variance has settled, not wound up nor died */
+    static const double prior[] = {0.4, 1e-5, 1e-5, 1e-4, 1e-5, 1e-4, 1e-5, 1e-5, 1e-6};
     double first = 0;
     double last = 0;
-    start(SIZE, variance);
+    start(SIZE, prior);
     for (int n = 0; n < 1000000; n++) {
         scalar phi[SIZE];
-        scalar K[SIZE];
-        random_row(SIZE, 10, phi);
-        ud.D[0] += walk;
-        (void)ud_update(&ud, phi, K);
-        expect_covariance();
-        first = n == 20000 ? real(ud_variance(&ud, 0)) : first;
+        gain K[SIZE];
+        random_row(SIZE, 0.5, phi);
+        if (n % 50 == 0) {
+            ud.D[0] += VARIANCE(50 * 1e-10);
+        }
+        (void)ud_update(&ud, phi, VARIANCE(0.0025), K);
+        expect_covariance(0.4 + 1e-5);
+        first = n == 20000 ? real_variance(ud_variance(&ud, 0)) : first;
     }
-    last = real(ud_variance(&ud, 0));
+    last = real_variance(ud_variance(&ud, 0));
     TEST_ASSERT_TRUE(last > 0.1 * first);
     TEST_ASSERT_TRUE(last < 10 * first);
 }
