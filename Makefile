@@ -7,7 +7,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
 C_FILES = find firmware tests/unit -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images demo paper test lint format generate clean
+.PHONY: help setup firmware images budget demo paper test lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -26,6 +26,11 @@ images: ## the Cortex-M images, build/cortex-m4f/diarc_ecu.elf and build/cortex-
 	    cmake --preset $$preset && cmake --build --preset $$preset --parallel $(JOBS) && \
 	    arm-none-eabi-size build/$$preset/diarc_ecu.elf || exit 1; done
 
+budget: ## flash, RAM, worst-case stack and instructions a tick of both images, beside their goals
+	@tools/setup.sh test
+	@$(MAKE) firmware
+	@$(PYTHON) tools/budget.py
+
 demo: ## the ECU moves a simulated arm; needs no CAN hardware
 	@tools/setup.sh demo
 	@$(MAKE) firmware
@@ -43,6 +48,10 @@ test: ## every test: unit tests in C, then pytest
 	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
 	@$(PYTHON) -m pytest
+
+rules: ## MISRA C:2012: write tests/rules/misra_findings.txt and the counts in docs/misra.md
+	@tools/setup.sh test
+	@$(PYTHON) tools/misra.py --update
 
 lint: ## check the style of Python and C
 	@tools/setup.sh demo

@@ -71,6 +71,11 @@ fi
 
 if [ "$purpose" = test ]; then
     need clang clang
+    need cppcheck cppcheck
+    # headers and libraries for gcc -m32, for PCs only
+    if [ "$(uname -m)" = x86_64 ] && ! echo '#include <stdio.h>' | gcc -m32 -E - >/dev/null 2>&1; then
+        missing+=(gcc-multilib)
+    fi
     need candump can-utils
     need ip iproute2
     need arm-none-eabi-gcc gcc-arm-none-eabi

@@ -195,9 +195,10 @@ void controller_step(struct controller *controller, const struct machine *machin
             out->u = diarc_joint(controller, machine, constants, &sample, &flow[i], (enum joint)i, theta,
                                  &desired, out);
         }
+        /* DIARC's set-point leads by a share of the spool's measured lag */
+        const scalar share = controller->kind == CONTROLLER_PID ? SCALAR(0) : machine->diarc[i].spool_lead;
         const scalar spool = valve_spool(&machine->cylinder[i], out->u);
-        const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);
-        out->u = limit(spool + lead, SCALAR(-1), SCALAR(1));
+        out->u = limit(spool + mul(share, spool - measured->spool[i]), SCALAR(-1), SCALAR(1));
         trajectory_advance(&controller->trajectory[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {

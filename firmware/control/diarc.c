@@ -79,8 +79,8 @@ struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *ga
     diarc->torque_ff = in->torque_ff;
 
     const struct two_steps s = two_steps(diarc, gains, in, ff_rate);
-    const scalar valve_gain = s.Q_Ld >= SCALAR(0) ? in->gain_extending : in->gain_retracting;
-    const scalar wanted = quot(s.Q_Ld, valve_gain); /* Eq 7 */
+    const scalar QL_gain = s.Q_Ld >= SCALAR(0) ? in->gain_extending : in->gain_retracting;
+    const scalar wanted = quot(s.Q_Ld, QL_gain); /* Eq 7 */
     const scalar u = symmetric_limit(wanted, SCALAR(1));
     const bool saturated = u != wanted;
 

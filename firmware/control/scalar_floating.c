@@ -98,9 +98,9 @@ int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high
 scalar scalar_from_real32(uint32_t bits, int8_t exponent)
 {
     const int16_t stored_exponent = (int16_t)((bits >> 23) & 0xFFu);
-    const int32_t fraction = (int32_t)(bits & 0x7FFFFFu);
+    const int32_t fraction_field = (int32_t)(bits & 0x7FFFFFu);
     /* subnormals have no hidden bit and the exponent of the smallest normal number */
-    const int32_t mantissa = stored_exponent == 0 ? fraction : fraction | 0x800000;
+    const int32_t mantissa = stored_exponent == 0 ? fraction_field : fraction_field | 0x800000;
     const int16_t binary_exponent = (int16_t)((stored_exponent == 0 ? 1 : stored_exponent) - 127 - 23);
     const scalar magnitude = (scalar)mantissa * power_of_two((int16_t)(binary_exponent - exponent));
     return (bits >> 31) != 0u ? -magnitude : magnitude;

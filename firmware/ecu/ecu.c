@@ -33,22 +33,33 @@ static void count_u16(uint16_t *counter)
     }
 }
 
-/* Back to the state of power-on; parameters stay. */
+/* Back to the state of power-on; parameters stay. Field by field: a copy of the whole would need its size in stack. */
 static void restart(struct ecu *ecu)
 {
-    const struct machine machine = ecu->machine;
-    const struct bases bases = ecu->bases;
-    const struct controller_constants constants = ecu->constants;
-    const uint32_t period_us = ecu->period_us;
-    *ecu = (struct ecu){
-        .machine = machine,
-        .bases = bases,
-        .constants = constants,
-        .period_us = period_us,
-        .mode = MODE_INIT,
-        .nmt = NMT_PRE_OPERATIONAL,
-        .boot_up_due = true,
-    };
+    ecu->mode = MODE_INIT;
+    ecu->nmt = NMT_PRE_OPERATIONAL;
+    ecu->fault = FAULT_NONE;
+    ecu->receive = (struct receive){0};
+    ecu->samples = (struct sensor_samples){0};
+    ecu->tare = (struct tare){0};
+    ecu->sampled = false;
+    ecu->sensors_wrong = 0;
+    ecu->restart_requested = false;
+    ecu->boot_up_due = true;
+    ecu->run_requested = false;
+    ecu->valves_active = false;
+    ecu->run_controller = CONTROLLER_PID;
+    ecu->sync_counter = 0;
+    ecu->phase = 0;
+    ecu->next_parameter = 0;
+    ecu->next_page = 0;
+    ecu->next_joint = 0;
+    ecu->heartbeat_ticks = 0;
+    for (uint8_t k = 0; k < ECU_TX_COUNTERS; k++) {
+        ecu->tx_counter[k] = 0;
+    }
+    ecu->complete_at_us = 0;
+    ecu->counters = (struct ecu_counters){0};
     controller_start(&ecu->controller, &ecu->machine, &ecu->constants);
 }
 

@@ -55,7 +55,7 @@ const char *pace_name(enum pace pace)
 
 static struct timespec to_timespec(int64_t time_ns)
 {
-    return (struct timespec){.tv_sec = time_ns / NS_PER_S, .tv_nsec = time_ns % NS_PER_S};
+    return (struct timespec){.tv_sec = (time_t)(time_ns / NS_PER_S), .tv_nsec = (long)(time_ns % NS_PER_S)};
 }
 
 /* First at the absolute time, then every `interval_ns` (0: never again). */
