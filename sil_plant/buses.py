@@ -443,7 +443,7 @@ def _check_interface(name: str) -> None:
     except (OSError, AttributeError) as error:
         raise BusError(
             f"cannot open {name}: this kernel has no CAN ({getattr(error, 'strerror', None) or error}): "
-            f"`sudo modprobe can_raw vcan`, {_WITHOUT_KERNEL}"
+            f"`sudo modprobe -a can_raw vcan`, {_WITHOUT_KERNEL}"
         ) from error
     with probe:
         virtual = name.startswith(("vcan", "vxcan"))

@@ -315,7 +315,7 @@ def test_kernel_without_can_is_answered_with_all_ways_out(monkeypatch: pytest.Mo
     with pytest.raises(BusError) as error:
         open_frame_port("vcan0")
     for part in (
-        "sudo modprobe can_raw vcan",
+        "sudo modprobe -a can_raw vcan",
         "--bus tcp:127.0.0.1:29536",
         "--bus inproc",
         "tools/vcan_vm",
