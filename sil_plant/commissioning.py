@@ -89,6 +89,11 @@ def commissioning_machine(machine: Machine) -> Machine:
     return with_changes(machine, changes, "commissioning")
 
 
+def plant_when_commissioned(plant_machine: Machine) -> Machine:
+    """The plant as it was when it was commissioned: the oil's viscosity changes only afterwards."""
+    return with_changes(plant_machine, {"effects.viscosity_factor": 1.0}, "commissioning")
+
+
 def _wide_sd(machine: Machine, prior: str) -> float:
     return WIDE_SHARE * (machine[f"estimator.prior.{prior}.high"] - machine[f"estimator.prior.{prior}.low"])
 

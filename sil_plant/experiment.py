@@ -11,14 +11,14 @@ from sil_plant.commissioning import (
     Finding,
     commissioning_machine,
     findings,
+    plant_when_commissioned,
 )
+from sil_plant.execution import PERIOD_US
 from sil_plant.inproc import InprocEcu, run_inproc
 from sil_plant.machine import Machine, parameter_image, with_changes
-from sil_plant.results import Result, Run, summarise
+from sil_plant.results import Result, run_of, summarise
 from sil_plant.scenario import Profile, Scenario, load_scenario
-from sil_plant.session import FAULTED, LOST, TICK, Session, make_session, sync_lost
-
-PERIOD_US = 1000
+from sil_plant.session import FAULTED, Session, make_session
 
 
 @dataclass(frozen=True)
@@ -71,19 +71,26 @@ def simulate(setup: Setup) -> Outcome:
     start = time.perf_counter()
     run_inproc(session, ecu, len(session.noise) + 1)
     wall_s = time.perf_counter() - start
-    run = Run(
-        controller=setup.controller,
-        arm=setup.machine.name,
-        scenario=setup.scenario.name,
-        seed=setup.seed,
-        bus="inproc",
-        timeline=session.timeline,
-        ticks=int(session.progress.index[TICK]),
-        lost_frames=int(session.monitor.whole[LOST] + sync_lost(session)),
-        wall_s=wall_s,
-        load_est_kg=float(session.monitor.load[0]),
+    run = run_of(
+        session,
+        setup.controller,
+        setup.machine.name,
+        setup.scenario.name,
+        setup.seed,
+        "inproc",
+        wall_s,
     )
     return Outcome(session, summarise(session.record, run), bool(session.monitor.whole[FAULTED]))
+
+
+def commissioning_setup(machine: Machine, profile: Profile, seed: int, move: Scenario) -> Setup:
+    """The run that identifies a machine: the ECU with its commissioning priors, the plant before it aged."""
+    setup = setup_for(machine, profile, move, seed=seed)
+    return replace(
+        setup,
+        machine=commissioning_machine(setup.machine),
+        plant_machine=plant_when_commissioned(setup.plant_machine),
+    )
 
 
 def commission(
@@ -110,9 +117,7 @@ def commission(
         One per parameter.
     """
     move = scenario or load_scenario(COMMISSION_SCENARIO)
-    setup = setup_for(machine, profile, move, seed=seed)
-    fresh = with_changes(setup.plant_machine, {"effects.viscosity_factor": 1.0}, "commissioning")
-    outcome = simulate(replace(setup, machine=commissioning_machine(setup.machine), plant_machine=fresh))
+    outcome = simulate(commissioning_setup(machine, profile, seed, move))
     found = findings(machine, outcome.session.monitor)
     values = {f"estimator.prior.{f.prior}.value": f.value for f in found}
     return with_changes(machine, values, "commissioned"), found

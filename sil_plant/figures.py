@@ -195,13 +195,8 @@ def draw_spools(axes: Axes, trace: Trace) -> None:
     _finish(axes, "Spool commands", "set-point, % of stroke")
 
 
-def run_figure(record: Record, period_s: float, title: str, motion_tick: int = 0, ticks: int | None = None) -> Figure:
-    """One run: angles, tracking errors, load estimate and spool commands; parameters as `trace_of`."""
-    return trace_figure(trace_of(record, period_s, motion_tick, ticks), title)
-
-
 def trace_figure(trace: Trace, title: str) -> Figure:
-    """The same of a trace."""
+    """One run: angles, tracking errors, load estimate and spool commands."""
     with matplotlib.rc_context():
         _use_style()
         figure = Figure(figsize=(WIDTH_PX / DPI, 0.66 * WIDTH_PX / DPI), dpi=DPI, layout="constrained")

@@ -273,12 +273,6 @@ def with_changes(machine: Machine, changes: dict[str, float], where: str) -> Mac
     return Machine(machine.name, machine.path, machine.base, machine.values | changes)
 
 
-def per_unit_exponent(exponents: tuple[int, int, int], base: dict[str, int]) -> int:
-    """Binary logarithm of a quantity's base."""
-    pressure, area, lever = (base[key] for key in BASE_KEYS)
-    return exponents[0] * pressure // 2 + exponents[1] * area // 2 + exponents[2] * lever
-
-
 def parameter_image(machine: Machine, changes: dict[str, Any] | None = None) -> bytes:
     """Make the image that the firmware starts from: ``diarc_ecu --params FILE``.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sil_plant.config import ConfigError
-from sil_plant.session import MODE_NAMES, Record, Timeline, trace_sha256
+from sil_plant.session import LOST, MODE_NAMES, TICK, Record, Session, Timeline, sync_lost, trace_sha256
 
 LOAD_BAND_KG = 0.1
 AFTER_S = 1.0
@@ -59,6 +59,22 @@ class Run:
     lost_frames: int
     wall_s: float
     load_est_kg: float
+
+
+def run_of(session: Session, controller: str, arm: str, scenario: str, seed: int, bus: str, wall_s: float) -> Run:
+    """Describe a session that has ended, whole or broken off; what it was called, and its wall time, s."""
+    return Run(
+        controller=controller,
+        arm=arm,
+        scenario=scenario,
+        seed=seed,
+        bus=bus,
+        timeline=session.timeline,
+        ticks=int(session.progress.index[TICK]),
+        lost_frames=int(session.monitor.whole[LOST] + sync_lost(session)),
+        wall_s=wall_s,
+        load_est_kg=float(session.monitor.load[0]),
+    )
 
 
 def settling_time(record: Record, ticks: int, timeline: Timeline) -> float | None:

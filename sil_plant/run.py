@@ -191,22 +191,18 @@ def main(argv: list[str]) -> int:
                 "interrupted; the valves are closed, what was recorded is kept",
             )
 
-    ticks = int(run.progress.index[session.TICK])
     if status == 0:
         problem = execution.outcome(run)
         status = EXIT_FAILED if problem else 0
-    if ticks:
-        figures = results.Run(
-            controller=arguments.controller,
-            arm=machine.name,
-            scenario=scenario.name,
-            seed=scenario.seed,
-            bus=arguments.bus,
-            timeline=run.timeline,
-            ticks=ticks,
-            lost_frames=int(run.monitor.whole[session.LOST] + session.sync_lost(run)),
-            wall_s=time.perf_counter() - start if wall_s is None else wall_s,
-            load_est_kg=float(run.monitor.load[0]),
+    if run.progress.index[session.TICK]:
+        figures = results.run_of(
+            run,
+            arguments.controller,
+            machine.name,
+            scenario.name,
+            scenario.seed,
+            arguments.bus,
+            time.perf_counter() - start if wall_s is None else wall_s,
         )
         if not write_outputs(arguments, run.record, figures):
             status = status or EXIT_WRONG_USE

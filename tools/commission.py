@@ -59,7 +59,7 @@ def move(arguments: argparse.Namespace, machine: Machine) -> session.Session:
     scenario = load_scenario(arguments.scenario)
     check_scenario(scenario, machine)
     plant = with_changes(machine, profile.effects, f"profile {profile.name}")
-    plant = with_changes(plant, scenario.plant | {"effects.viscosity_factor": 1.0}, str(arguments.scenario))
+    plant = commissioning.plant_when_commissioned(with_changes(plant, scenario.plant, str(arguments.scenario)))
     execution.compile_plant(machine, scenario)
     try:
         run = session.make_session(plant, scenario, "diarc", arguments.seed, execution.PERIOD_US * 1e-6, profile.tare)

@@ -36,9 +36,9 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from sil_plant import figures, paper_figures  # noqa: E402
 from sil_plant import paper_report as report  # noqa: E402
-from sil_plant.commissioning import COMMISSION_SCENARIO, UNITS, Finding, commissioning_machine  # noqa: E402
+from sil_plant.commissioning import COMMISSION_SCENARIO, UNITS, Finding  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.experiment import Outcome, Setup, commission, setup_for, simulate  # noqa: E402
+from sil_plant.experiment import Outcome, Setup, commission, commissioning_setup, setup_for, simulate  # noqa: E402
 from sil_plant.machine import ARMS, JOINT_NAMES, Machine, load_machine, with_changes  # noqa: E402
 from sil_plant.paper_report import Bar, Case, ParameterFinding, Report  # noqa: E402
 from sil_plant.results import AFTER_S, LOAD_BAND_KG  # noqa: E402
@@ -415,8 +415,7 @@ def run_job(job: Job) -> list[Case]:
 
 def _commissioning_case(job: Job, parameters: tuple[ParameterFinding, ...]) -> Case:
     """The commissioning run itself, once more, for its figures."""
-    setup = setup_for(job.machine, job.profile, job.commission_scenario, seed=job.seed)
-    setup = replace(setup, machine=commissioning_machine(setup.machine))
+    setup = commissioning_setup(job.machine, job.profile, job.seed, job.commission_scenario)
     operation = Operation("commission", job.commission_scenario, job.seed)
     case = measure(job.profile.name, operation, setup, simulate(setup), None)
     bars = parameter_bars(parameters, job.limits) if job.limits else ()

@@ -18,10 +18,8 @@ void controller_start(struct controller *controller, const struct machine *machi
     estimator_start(&controller->estimator, &machine->estimator, &constants->estimator);
 }
 
-void controller_arm(struct controller *controller, enum controller_kind kind,
-                    const struct controller_constants *constants, const scalar q[JOINTS])
+void controller_arm(struct controller *controller, enum controller_kind kind, const scalar q[JOINTS])
 {
-    (void)constants;
     controller->kind = kind;
     controller->armed = true;
     for (uint8_t i = 0; i < JOINTS; i++) {

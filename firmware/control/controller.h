@@ -70,8 +70,7 @@ void controller_start(struct controller *controller, const struct machine *machi
                       const struct controller_constants *constants);
 
 /* Arm at the measured angle, bumplessly: the next step begins at rest, with the measured force wanted. */
-void controller_arm(struct controller *controller, enum controller_kind kind,
-                    const struct controller_constants *constants, const scalar q[JOINTS]);
+void controller_arm(struct controller *controller, enum controller_kind kind, const scalar q[JOINTS]);
 
 void controller_disarm(struct controller *controller);
 

@@ -446,7 +446,7 @@ static void arm_if_requested(struct ecu *ecu, bool good, const struct measuremen
         refuse(ecu, REFUSAL_SENSORS_NOT_FRESH);
         return;
     }
-    controller_arm(&ecu->controller, ecu->run_controller, &ecu->constants, measured->q);
+    controller_arm(&ecu->controller, ecu->run_controller, measured->q);
     ecu->mode = MODE_RUN;
 }
 
