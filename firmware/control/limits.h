@@ -10,6 +10,7 @@ struct limits {
     scalar rate[JOINTS];   /* rad/s */
     scalar pressure_step;  /* Pa from one tick to the next */
     scalar pressure_range; /* Pa */
+    scalar angle_range;    /* rad outside the joint's range */
     scalar stuck_travel;   /* rad */
     scalar stuck_s;
     scalar mismatch_updates;

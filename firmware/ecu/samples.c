@@ -5,7 +5,6 @@
 #include "ecu/wire.h"
 
 #define SENSOR_STATUS_INVALID DIARC_ENCODERS_SENSOR_STATUS_INVALID_CHOICE
-#define ANGLE_BEYOND SCALAR(0.2) /* rad outside a joint's range where no arm can be */
 
 static scalar angle_of(int32_t raw)
 {
@@ -26,8 +25,9 @@ static enum ecu_fault missing(const struct ecu *ecu, enum received_frame row)
 static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t raw, int32_t before)
 {
     const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
+    const scalar beyond = ecu->machine.limits.angle_range;
     const scalar q = angle_of(raw);
-    if (q < cylinder->q_min - ANGLE_BEYOND || q > cylinder->q_max + ANGLE_BEYOND) {
+    if (q < cylinder->q_min - beyond || q > cylinder->q_max + beyond) {
         return FAULT_SENSOR_RANGE;
     }
     /* the sample before may be the prediction: an increment over one tick all the same */
