@@ -53,6 +53,7 @@ static void restart(struct ecu *ecu)
     ecu->phase = 0;
     ecu->next_parameter = 0;
     ecu->next_page = 0;
+    ecu->next_bucket = 0;
     ecu->next_joint = 0;
     ecu->heartbeat_ticks = 0;
     for (uint8_t k = 0; k < ECU_TX_COUNTERS; k++) {
@@ -498,6 +499,7 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
         send_valves(ecu, port);
         const uint32_t tick_time_us = port->now_us(port->context) - ecu->complete_at_us;
         ecu->counters.tick_time_us = tick_time_us < UINT16_MAX ? (uint16_t)tick_time_us : UINT16_MAX;
+        time_histogram_add(&ecu->counters.tick_times, tick_time_us);
         send_slow_frames(ecu, port);
     } else {
         shut_valves(ecu, port);
@@ -517,4 +519,38 @@ void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port)
         leave_run(ecu, MODE_STANDBY);
     }
     send_valves(ecu, port);
+}
+
+void ecu_note_late_start(struct ecu *ecu, uint32_t missed_periods)
+{
+    const uint32_t room = (uint32_t)UINT16_MAX - ecu->counters.late_ticks;
+    ecu->counters.late_ticks =
+        (uint16_t)(ecu->counters.late_ticks + (missed_periods < room ? missed_periods : room));
+}
+
+void ecu_request_safe_stop(struct ecu *ecu)
+{
+    ecu->run_requested = false;
+    if (ecu->mode == MODE_RUN) {
+        leave_run(ecu, MODE_STANDBY);
+    }
+}
+
+bool ecu_valves_shut(const struct ecu *ecu)
+{
+    return !ecu->valves_active;
+}
+
+void ecu_rehearse(const struct ecu *ecu, struct controller *understudy)
+{
+    if (!ecu->sampled) {
+        return;
+    }
+    *understudy = ecu->controller;
+    struct measurement measured = measurement(ecu, &ecu->samples);
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        /* the samples are their own predecessors: at rest, to the estimator, but for this */
+        measured.dq[i] = mul(ecu->controller.output[i].reference.w, ecu->constants.dt_s);
+    }
+    controller_step(understudy, &ecu->machine, &ecu->constants, &measured);
 }

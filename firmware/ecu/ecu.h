@@ -12,6 +12,7 @@
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
+#include "ecu/time_histogram.h"
 
 #define ECU_NODE_ID 1u
 #define ECU_PERIOD_LOW_US 250u
@@ -62,11 +63,12 @@ struct tare {
 
 struct ecu_counters {
     uint32_t ticks;      /* since the restart */
-    uint16_t late_ticks; /* ended without all sensor frames; stops at 65535 */
+    uint16_t late_ticks; /* ended without all sensor frames, or periods without a tick; stops at 65535 */
     uint16_t send_drops; /* frames the port did not take; stops at 65535 */
     uint16_t refused;    /* requests; stops at 65535 */
     enum ecu_refusal last_refusal;
-    uint16_t tick_time_us; /* last sensor frame to valve frame, of the last tick; stops at 65535 */
+    uint16_t tick_time_us;            /* last sensor frame to valve frame, of the last tick; stops at 65535 */
+    struct time_histogram tick_times; /* of these */
 };
 
 #define ECU_TX_COUNTERS 5
@@ -93,7 +95,7 @@ struct ecu {
     enum controller_kind run_controller;
     uint8_t sync_counter; /* 1..240 */
     uint8_t phase;        /* tick modulo the slow frames' cycle */
-    uint8_t next_parameter, next_page, next_joint;
+    uint8_t next_parameter, next_page, next_bucket, next_joint;
     uint16_t heartbeat_ticks; /* to the next heartbeat */
     uint8_t tx_counter[ECU_TX_COUNTERS];
     uint32_t complete_at_us; /* when the last sensor frame of this tick came */
@@ -108,6 +110,19 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
 void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port);
+
+/* Runs the law once on a copy, for nothing: between ecu_tick_begin and the sensor frames, for a port whose caches
+ * other programs use in the meantime. Neither reads frames nor sends any, and *ecu stays as it is. */
+void ecu_rehearse(const struct ecu *ecu, struct controller *understudy);
+
+/* The timer fired late: this many periods went by without a tick. They count as late ticks. */
+void ecu_note_late_start(struct ecu *ecu, uint32_t missed_periods);
+
+/* A port that wants to stop: it goes on ticking until the valves are shut, which takes a while when they are
+ * driven, then calls ecu_shutdown. */
+void ecu_request_safe_stop(struct ecu *ecu);
+/* The last valve frame, if there was one, had zero and disabled. */
+bool ecu_valves_shut(const struct ecu *ecu);
 
 /* Valves to zero and disabled, once, now: for a port that is about to stop. */
 void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port);
