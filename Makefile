@@ -4,7 +4,7 @@ JOBS := $(shell nproc 2>/dev/null || echo 2)
 MAKEFLAGS += --no-print-directory
 # compiles the plant when its sources have changed, so that no test waits for it
 COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
-C_FILES = find firmware tests/unit -name '*.[ch]' -not -path '*/generated/*'
+C_FILES = find firmware tests/unit tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
 .PHONY: help setup firmware images budget demo paper test lint format generate clean

@@ -53,6 +53,7 @@ static void restart(struct ecu *ecu)
     ecu->phase = 0;
     ecu->next_parameter = 0;
     ecu->next_page = 0;
+    ecu->next_bucket = 0;
     ecu->next_joint = 0;
     ecu->heartbeat_ticks = 0;
     for (uint8_t k = 0; k < ECU_TX_COUNTERS; k++) {
@@ -247,6 +248,7 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
         send_valves(ecu, port);
         const uint32_t tick_time_us = port->now_us(port->context) - ecu->complete_at_us;
         ecu->counters.tick_time_us = tick_time_us < UINT16_MAX ? (uint16_t)tick_time_us : UINT16_MAX;
+        time_histogram_add(&ecu->counters.tick_times, tick_time_us);
         send_slow_frames(ecu, port);
     } else {
         shut_valves(ecu, port);
@@ -271,15 +273,34 @@ bool ecu_valves_shut(const struct ecu *ecu)
     return !ecu->valves_active && !mode_drives(ecu->mode);
 }
 
+/* The sum, or the highest count there is. */
+static uint16_t add_limited_u16(uint16_t count, uint32_t more)
+{
+    return more < (uint32_t)UINT16_MAX - count ? (uint16_t)(count + more) : UINT16_MAX;
+}
+
 void ecu_note_late_start(struct ecu *ecu, uint32_t missed_periods)
 {
-    uint16_t *const starts = &ecu->supervision.late_starts;
-    const uint32_t sum = *starts + missed_periods;
-    *starts = missed_periods < UINT16_MAX && sum < UINT16_MAX ? (uint16_t)sum : UINT16_MAX;
+    ecu->counters.late_ticks = add_limited_u16(ecu->counters.late_ticks, missed_periods);
+    ecu->supervision.late_starts = add_limited_u16(ecu->supervision.late_starts, missed_periods);
 }
 
 void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port)
 {
     (void)operation_event(ecu, EVENT_NMT_LEFT);
     send_valves(ecu, port);
+}
+
+void ecu_rehearse(const struct ecu *ecu, struct controller *understudy)
+{
+    if (!ecu->sampled) {
+        return;
+    }
+    *understudy = ecu->controller;
+    struct measurement measured = samples_measured(ecu, &ecu->samples);
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        /* the samples are their own predecessors: at rest, to the estimator, but for this */
+        measured.dq[i] = mul(ecu->controller.output[i].reference.w, ecu->constants.dt_s);
+    }
+    controller_step(understudy, &ecu->machine, &ecu->constants, &measured);
 }

@@ -19,6 +19,7 @@
 #include "ecu/samples.h"
 #include "ecu/supervision.h"
 #include "ecu/tare.h"
+#include "ecu/time_histogram.h"
 
 #define ECU_NODE_ID 1u
 #define ECU_PERIOD_LOW_US 250u
@@ -28,11 +29,12 @@ enum nmt_state { NMT_STOPPED = 4, NMT_OPERATIONAL = 5, NMT_PRE_OPERATIONAL = 127
 
 struct ecu_counters {
     uint32_t ticks;      /* since the restart */
-    uint16_t late_ticks; /* ended without all sensor frames; stops at 65535 */
+    uint16_t late_ticks; /* ended without all sensor frames, or periods without a tick; stops at 65535 */
     uint16_t send_drops; /* frames the port did not take; stops at 65535 */
     uint16_t refused;    /* requests; stops at 65535 */
     enum ecu_refusal last_refusal;
-    uint16_t tick_time_us; /* last sensor frame to valve frame, of the last tick; stops at 65535 */
+    uint16_t tick_time_us;            /* last sensor frame to valve frame, of the last tick; stops at 65535 */
+    struct time_histogram tick_times; /* of these */
 };
 
 #define ECU_TX_COUNTERS 5
@@ -65,7 +67,7 @@ struct ecu {
     uint32_t master_hash;        /* of the master's DBC, object 2002h; 0: not told */
     uint8_t sync_counter;        /* 1..240 */
     uint8_t phase;               /* tick modulo the slow frames' cycle */
-    uint8_t next_parameter, next_page, next_joint;
+    uint8_t next_parameter, next_page, next_bucket, next_joint;
     uint16_t heartbeat_ticks; /* to the next heartbeat */
     uint8_t tx_counter[ECU_TX_COUNTERS];
     uint32_t complete_at_us; /* when the last sensor frame of this tick came */
@@ -81,13 +83,17 @@ void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
 void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port);
 
+/* Runs the law once on a copy, for nothing: between ecu_tick_begin and the sensor frames, for a port whose caches
+ * other programs use in the meantime. Neither reads frames nor sends any, and *ecu stays as it is. */
+void ecu_rehearse(const struct ecu *ecu, struct controller *understudy);
+
 /* For a port that is about to stop: SAFE_STOP where the valves are driven; go on ticking until ecu_valves_shut. */
 void ecu_request_safe_stop(struct ecu *ecu);
 
 /* The last valve frame was zero and disabled. */
 bool ecu_valves_shut(const struct ecu *ecu);
 
-/* Strict pace: so many periods of the timer were missed before this tick. */
+/* The timer fired late: so many periods went by without a tick. They count as late ticks. */
 void ecu_note_late_start(struct ecu *ecu, uint32_t missed_periods);
 
 /* Valves to zero and disabled, once, now: for a port that cannot tick any more. */

@@ -11,7 +11,8 @@ enum tx_counter { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING 
 #define VALVE_ACTIVE DIARC_VALVES_SWING_CONTROL_ACTIVE_CHOICE
 
 #define THETA_FRAMES (THETA_M + THETA_H)
-#define TIMING_PAGES 4
+#define TIMING_PAGES 5
+#define PAGE_TICK_TIMES 4
 
 /* Protect a packed frame and advance its counter. */
 static void protect(struct ecu *ecu, enum tx_counter which, struct can_frame_11bit *frame)
@@ -204,6 +205,10 @@ struct can_frame_11bit transmit_timing(struct ecu *ecu)
     const uint8_t page = ecu->next_page;
     ecu->next_page = (uint8_t)((page + 1u) % TIMING_PAGES);
     const struct ecu_counters *const counters = &ecu->counters;
+    const uint8_t bucket = ecu->next_bucket;
+    if (page == PAGE_TICK_TIMES) {
+        ecu->next_bucket = (uint8_t)((bucket + 1u) % TIME_BUCKETS);
+    }
     const struct diarc_timing_t message = {
         .mode = (uint8_t)ecu->mode,
         .timing_page = page,
@@ -217,6 +222,8 @@ struct can_frame_11bit transmit_timing(struct ecu *ecu)
         .refused_requests = counters->refused,
         .last_refusal = (uint8_t)counters->last_refusal,
         .period_us = (uint16_t)ecu->period_us,
+        .tick_time_bucket = bucket,
+        .tick_time_count = counters->tick_times.count[bucket],
     };
     struct can_frame_11bit frame = {.id = DIARC_TIMING_FRAME_ID, .length = DIARC_TIMING_LENGTH};
     (void)diarc_timing_pack(frame.data, &message, sizeof frame.data);

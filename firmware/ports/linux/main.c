@@ -24,7 +24,7 @@ enum { EXIT_RUN_FAILED = 1, EXIT_WRONG_USE = 2 };
 /* Static: no heap, and too large for a stack that strict pace locks in memory. */
 static struct ecu the_ecu;
 static struct parameter_image the_image;
-static struct bus socketcan_bus;
+static struct socketcan socketcan_bus;
 static struct socketcand_client socketcand_bus;
 
 /* Reads exactly one image; false after one line on stderr. */
@@ -58,7 +58,7 @@ static bool read_image(const char *path, struct parameter_image *image)
 
 static struct bus *open_bus(const struct options *options)
 {
-    struct bus *const bus = options->is_tcp ? &socketcand_bus.bus : &socketcan_bus;
+    struct bus *const bus = options->is_tcp ? &socketcand_bus.bus : &socketcan_bus.bus;
     const bool open = options->is_tcp
                           ? socketcand_open(&socketcand_bus, options->host, options->port, SOCKETCAND_CHANNEL)
                           : socketcan_open(&socketcan_bus, options->bus);
@@ -69,18 +69,38 @@ static struct bus *open_bus(const struct options *options)
     return bus;
 }
 
-static void request_realtime(const char *program)
+/* The strict pace needs it and says what is missing; at realtime pace it is welcome where it is permitted. */
+static void request_realtime(enum pace pace, const char *program)
 {
     bool has_fifo;
     bool has_locked_memory;
+    if (pace == PACE_LOCKSTEP) {
+        return; /* at full speed, beside others */
+    }
     realtime_request(&has_fifo, &has_locked_memory);
-    if (!has_fifo || !has_locked_memory) {
+    if (pace == PACE_STRICT && (!has_fifo || !has_locked_memory)) {
         (void)fprintf(stderr,
                       "diarc_ecu: no permission for %s%s%s, so ticks may be late; permit with "
                       "sudo setcap cap_sys_nice,cap_ipc_lock=ep %s or raise ulimit -r and -l\n",
                       has_fifo ? "" : "SCHED_FIFO", !has_fifo && !has_locked_memory ? " and " : "",
                       has_locked_memory ? "" : "locked memory", program);
     }
+}
+
+/* One line; empty buckets at the end are left out. */
+static void print_histogram(const char *what, const struct time_histogram *histogram)
+{
+    int last = TIME_BUCKETS - 1;
+    while (last > 0 && histogram->count[last] == 0) {
+        last--;
+    }
+    (void)printf("diarc_ecu: %s, us:", what);
+    for (int i = 0; i <= last; i++) {
+        const bool is_open = i == TIME_BUCKETS - 1;
+        (void)printf("  %s%lu %lu", is_open ? ">=" : "<", is_open ? 1ul << (i - 1) : 1ul << i,
+                     (unsigned long)histogram->count[i]);
+    }
+    (void)putchar('\n');
 }
 
 static void print_stats(const struct loop_stats *loop, const struct bus_stats *bus)
@@ -90,6 +110,9 @@ static void print_stats(const struct loop_stats *loop, const struct bus_stats *b
                  (unsigned long long)loop->ticks, (unsigned long long)loop->late_ticks,
                  (unsigned long long)loop->stalled_ticks, (unsigned long long)bus->send_drops,
                  (unsigned long long)bus->receive_errors, (unsigned long long)bus->receive_drops);
+    print_histogram("ticks by start after the timer", &loop->start_times);
+    print_histogram("ticks since the last restart by time from last sensor frame to valve frame",
+                    &the_ecu.counters.tick_times);
 }
 
 static int run(const struct options *options, const char *program)
@@ -111,9 +134,7 @@ static int run(const struct options *options, const char *program)
     if (bus == NULL) {
         return EXIT_WRONG_USE;
     }
-    if (options->pace == PACE_STRICT) {
-        request_realtime(program);
-    }
+    request_realtime(options->pace, program);
     if (!options->quiet) {
         (void)printf("diarc_ecu " DIARC_VERSION " on %s, %s pace, %lu us\n", options->bus,
                      pace_name(options->pace), (unsigned long)options->period_us);
@@ -130,13 +151,14 @@ static int run(const struct options *options, const char *program)
         (void)fprintf(stderr, "diarc_ecu: %s\n", bus->message);
         exit_status = bus->state == BUS_REFUSED ? EXIT_WRONG_USE : EXIT_RUN_FAILED;
     }
+    const bool was_up = bus->state == BUS_UP;
     const bool delivered = bus->close(bus->port.context);
     if (end == LOOP_STOPPED && !(delivered && stats.shutdown_sent)) {
         (void)fputs(
             "diarc_ecu: the last valve frame (zero, disabled) could not be sent; the valves close at the "
             "timeout of their node\n",
             stderr);
-        exit_status = EXIT_RUN_FAILED;
+        exit_status = was_up ? EXIT_RUN_FAILED : 0; /* without a bus there was nothing left to do */
     }
     if (!options->quiet) {
         print_stats(&stats, &bus->stats);

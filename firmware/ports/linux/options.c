@@ -216,7 +216,8 @@ void options_print_help(void)
         "  diarc_ecu can0 --pace strict           an adapter, 1 Mbit/s\n"
         "  diarc_ecu tcp:127.0.0.1:29536          socketcand, channel vcan0; no kernel driver needed\n"
         "\n"
-        "exit: 0 stopped by SIGINT, SIGTERM or SIGHUP; 1 the bus went down, or did not take the last valve\n"
-        "frame; 2 wrong use, or the bus cannot be opened\n",
+        "SIGINT, SIGTERM and SIGHUP: safe stop, valves shut, end; a second one ends at once, valves shut.\n"
+        "exit: 0 stopped by such a signal; 1 the bus is gone, or did not take the last valve frame; 2 wrong\n"
+        "use, or the bus cannot be opened\n",
         stdout);
 }
