@@ -11,7 +11,7 @@ import numpy as np
 from sil_plant import protocol
 from sil_plant.buses import FramePort
 from sil_plant.frames import FRAME_BYTES, from_row, to_row
-from sil_plant.io_node import IO_HEARTBEAT_S, advance_one_period, heartbeat_row
+from sil_plant.io_node import advance_one_period
 from sil_plant.session import (
     DBC_HASH,
     HASH_HEARD,
@@ -107,10 +107,7 @@ def run_on_bus(session: Session, port: FramePort, progress: Callable[[int], None
     """
     out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     heartbeat_id = protocol.frame_id("HEARTBEAT_ECU")
-    period_s = session.timing.period_s
     check_tick = session.timeline.run_request
-    heartbeat_ticks = max(1, round(IO_HEARTBEAT_S / period_s))
-    heartbeat = from_row(heartbeat_row())
     while True:
         frame = port.receive(ECU_LOST_S)
         if frame is None:
@@ -125,10 +122,7 @@ def run_on_bus(session: Session, port: FramePort, progress: Callable[[int], None
             rows = on_sync(session, data[0], out)
             if rows < 0:
                 return
-            answer = [from_row(row) for row in out[:rows]]
-            if tick % heartbeat_ticks == 0:
-                answer.append(heartbeat)
-            port.send_many(answer)
+            port.send_many([from_row(row) for row in out[:rows]])
             if tick % 100 == 0:
                 progress(tick)
         elif can_id == heartbeat_id and data == b"\0":

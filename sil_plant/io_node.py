@@ -60,6 +60,7 @@ class NodeTiming(NamedTuple):
     period_s: float
     delay_s: float
     timeout_ticks: int
+    heartbeat_ticks: int
 
 
 class Node(NamedTuple):
@@ -131,6 +132,7 @@ def node_timing(machine: Machine, period_s: float) -> NodeTiming:
         period_s=period_s,
         delay_s=min(machine["io.command_delay_s"], period_s),
         timeout_ticks=max(1, round(machine["io.valve_timeout_s"] / period_s)),
+        heartbeat_ticks=max(1, round(IO_HEARTBEAT_S / period_s)),
     )
 
 
