@@ -178,12 +178,21 @@ class Emergency:
     fault: str  # its name in the DBC
 
 
+def _fault_choices() -> dict[int, str]:
+    signal = protocol.database().get_message_by_name("TIMING").get_signal_by_name("FaultCode")
+    return {int(code): str(name) for code, name in (signal.choices or {}).items()}
+
+
+def fault_names() -> set[str]:
+    """Names of the ECU's faults in the DBC."""
+    return set(_fault_choices().values())
+
+
 def emergencies(session: Session) -> list[Emergency]:
     """Every emergency frame of a run; error code 0: the fault is over."""
-    message = protocol.database().get_message_by_name("TIMING")
-    names = message.get_signal_by_name("FaultCode").choices or {}
+    names = _fault_choices()
     rows = session.record.emergency[: session.monitor.whole[EMERGENCIES]].tolist()
-    return [Emergency(tick, code, str(names.get(fault, fault))) for tick, code, fault in rows]
+    return [Emergency(tick, code, names.get(fault, str(fault))) for tick, code, fault in rows]
 
 
 def fault_lines(session: Session, faults: tuple[Fault, ...]) -> list[str]:

@@ -318,11 +318,7 @@ def test_foreign_traffic_of_higher_priority_does_not_leave_more_than_the_rest(ob
     logs = observe("alien_traffic", "higher_priority", 0.6).to_ecu[BEGIN + 2 : END]
     bits = sum(protocol.worst_case_bits(len(data)) for log in logs for can_id, data in log if can_id < 0x80)
     assert 0.5 < bits / (1000 * len(logs)) <= 0.62
-    late = [
-        counter(data) != (BEGIN + 2 + k) % 15
-        for k, log in enumerate(logs)
-        for data in of(log, "PRESSURES_WRIST")
-    ]
+    late = [counter(data) != (BEGIN + 2 + k) % 15 for k, log in enumerate(logs) for data in of(log, "PRESSURES_WRIST")]
     assert late and all(late)
 
 
