@@ -137,7 +137,7 @@ def run_on_bus(
             alive()
             raise EcuLostError(f"the ECU fell silent for {ECU_LOST_S:g} s; the valves are closed")
         can_id, data = frame
-        if can_id == protocol.SYNC_ID and power is not None and ecu_is_dead(session):
+        if can_id == protocol.SYNC_ID and power is not None and session.faulty and ecu_is_dead(session):
             sit_out_death(session, port, power, out)
         elif can_id == protocol.SYNC_ID and data:
             tick = int(session.progress.index[TICK])
@@ -177,8 +177,9 @@ def sit_out_death(session: Session, port: FramePort, power: EcuPower, out: np.nd
 
 def reboot_expected(session: Session) -> bool:
     """True from the first fault on that makes an ECU begin anew."""
-    begun = session.injection.first < session.progress.index[TICK]
-    return bool(np.any(begun & np.isin(session.injection.kind, (injection.NMT_RESET, injection.ECU_KILLED))))
+    plan = session.injection.plan
+    kinds = plan[plan[:, injection.FIRST] < session.progress.index[TICK], injection.KIND]
+    return bool(np.isin(kinds, (injection.NMT_RESET, injection.ECU_KILLED)).any())
 
 
 def check_hash(session: Session) -> None:
@@ -198,10 +199,11 @@ def warm_up(session: Session) -> None:
     """Compile all that a run on a bus calls, with a session that is thrown away afterwards."""
     out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     on_sync(session, 6, out)
-    without_sync(session, out)
-    ecu_is_dead(session)
     for row in out[:1]:
         on_frame(session, to_row(*from_row(row)))
+    if session.faulty:
+        without_sync(session, out)
+        ecu_is_dead(session)
     motion_frame(0, REQUEST_STANDBY)
     close_valves(session)
 

@@ -79,7 +79,8 @@ def compile_plant(machine: Machine, scenario: Scenario) -> None:
     """
     from numba.core import config
 
-    if not any(Path(config.CACHE_DIR).glob("**/session.on_sync*.nbi")):
+    compiled = "on_sync_with_faults" if scenario.faults else "on_sync_plain"
+    if not any(Path(config.CACHE_DIR).glob(f"**/session.{compiled}*.nbi")):
         say("compiling the plant, once after installation (about 20 s) ...")
     short = with_load(replace(scenario, duration_s=0.01), 0.0)
     try:
@@ -179,7 +180,7 @@ def check_faults(faults: tuple[Fault, ...], in_process: bool, spawned: bool) -> 
 def outcome(run: session.Session) -> str | None:
     """What went wrong in a run that reached its end, or None. With faults on purpose, only how it ended counts."""
     whole = run.monitor.whole
-    on_purpose = run.injection.kind.size > 0
+    on_purpose = len(run.injection.plan) > 0
     if whole[session.FAULTED] and not on_purpose:
         return f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
     if whole[session.MODE] != session.MODE_RUN:

@@ -19,28 +19,29 @@ from sil_plant import session
 from sil_plant.config import ROOT, ConfigError, TomlFile
 from sil_plant.experiment import Outcome, setup_for, simulate
 from sil_plant.faults import KINDS, SENSORS, Fault, size_range
-from sil_plant.injection import SPIKE_CHANCE, draw
+from sil_plant.injection import FIRST, LAST, SPIKE_CHANCE, draw
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine
 from sil_plant.results import emergencies
 from sil_plant.scenario import PROFILE_NAMES, LoadStep, Scenario, Segment, load_profile
 
 TABLE = ROOT / "sil_plant" / "fault_matrix.toml"
-REACTIONS = ("none", "safe", "degrade", "node")
+REACTIONS = ("none", "safe", "shut", "degrade", "node")
 CASE_KEYS = {
     "kind", "targets", "sizes", "duration_s", "moments", "faults", "reaction", "after_ticks", "when_moved",
     "when_error", "may_detect", "error_factor",
 }  # fmt: skip
 
 # The run: there, a rest, and back, which is the proof that the ECU has recovered.
-MOVE_S, REST_S, FAR_RAD, LOAD_KG = 0.8, 1.2, 0.4, 3.0
+MOVE_S, REST_S, FAR_RAD, LOAD_KG = 0.8, 1.5, 0.4, 3.0
 DURATION_S = 2 * MOVE_S + REST_S + 0.4
 MOMENTS = {"top": 0.4, "end": 0.7, "rest": 1.0, "run": 0.0}
 FAULT_S = 0.2
-RECOVER_AFTER_S = 0.5
+RECOVER_AFTER_S = 0.9
 
 # The rules of every row
 SAFE_TICKS = 5
-REST_LIMIT_S = 0.5
+REST_LIMIT_S = 0.5  # of a safe stop
+HARD_REST_LIMIT_S = 0.9  # of valves that close at once: the arm swings on its oil
 REST_RAD_S = 0.02
 NODE_SLACK_TICKS = 2  # over the node's own timeout
 RECOVERED_ERROR_RAD = 5e-3  # at the end of the run
@@ -220,7 +221,7 @@ def digest(outcome: Outcome) -> str:
     """Hash of what happened: true states, valve commands on both sides, modes, emergencies."""
     record = outcome.session.record
     total = hashlib.sha256()
-    for array in (record.state, record.command, record.sent, record.in_effect, record.mode, record.emergency):
+    for array in (record.state, record.command, record.valves, record.mode, record.emergency):
         total.update(np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
 
@@ -228,7 +229,7 @@ def digest(outcome: Outcome) -> str:
 def possible_tick(cell: Cell, outcome: Outcome) -> int | None:
     """The tick from which on the ECU could know; None: it never could."""
     case, run_ = cell.case, outcome.session
-    first, last = int(run_.injection.first[0]), int(run_.injection.last[0])
+    first, last = int(run_.injection.plan[0, FIRST]), int(run_.injection.plan[0, LAST])
     tick = first + case.after_ticks
     if case.kind == "spiked":
         spikes = [t for t in range(first, last) if draw(run_.injection.seed, 0, t, 0) < SPIKE_CHANCE]
@@ -250,7 +251,7 @@ def judge(cell: Cell, outcome: Outcome, again: Outcome) -> Row:
     """Hold a run, and its repetition, against the rules."""
     case, run_ = cell.case, outcome.session
     record, whole = run_.record, run_.monitor.whole
-    first, last = int(run_.injection.first[0]), int(run_.injection.last[0])
+    first, last = int(run_.injection.plan[0, FIRST]), int(run_.injection.plan[0, LAST])
     acts = int(run_.injection.recover[0]) if run_.injection.recover.size else len(record.mode)
     wrong: list[str] = []
 
@@ -259,7 +260,7 @@ def judge(cell: Cell, outcome: Outcome, again: Outcome) -> Row:
     left = np.flatnonzero(np.isin(record.mode[first + 1 : acts], SAFE_MODES))
     # the mode stands on the valve frame that ends a tick, and in the next row of the record
     left_tick = first + int(left[0]) if left.size else None
-    shut = np.flatnonzero(np.all(np.abs(record.in_effect[first:acts]) < CENTRED, axis=1))
+    shut = np.flatnonzero(np.all(np.abs(record.valves[first:acts, :2]) < CENTRED, axis=1))
     shut_tick = first + int(shut[0]) if shut.size else None
     possible = possible_tick(cell, outcome)
 
@@ -301,8 +302,9 @@ def judge(cell: Cell, outcome: Outcome, again: Outcome) -> Row:
     if stopped is not None and case.reaction != "none":
         moving = np.flatnonzero(speed > REST_RAD_S)
         rest_s = float((moving[-1] + 1 if moving.size else 0) * run_.timeline.period_s)
-        if rest_s > REST_LIMIT_S:
-            wrong.append(f"not at rest {REST_LIMIT_S:g} s after the stop")
+        limit_s = HARD_REST_LIMIT_S if case.reaction in ("node", "shut") else REST_LIMIT_S
+        if rest_s > limit_s:
+            wrong.append(f"not at rest {limit_s:g} s after the stop")
 
     recovered_by = _requests(record.mode, acts)
     if whole[session.MODE] != session.MODE_RUN:
@@ -333,7 +335,7 @@ def judge(cell: Cell, outcome: Outcome, again: Outcome) -> Row:
         emergency=f"{alarm.code:04X}h" if alarm else "",
         after_ticks=safe_tick - possible if safe_tick is not None and possible is not None else None,
         max_speed_rad_s=float(speed.max()) if speed.size else 0.0,
-        max_command=float(np.abs(record.in_effect[min(after + 2, acts - 1) : acts]).max()),
+        max_command=float(np.abs(record.valves[min(after + 2, acts - 1) : acts, :2]).max()),
         rest_s=rest_s,
         recovered_by=recovered_by if last < len(record.mode) else "",
         error_factor=factor,

@@ -63,73 +63,66 @@ _SDO_TO_ECU, _HEARTBEAT_ECU, _MASTER_HASH_INDEX = 0x601, 0x701, 0x2002
 
 # Where a held frame goes when it is due
 FREE, TO_ECU_FIRST, TO_ECU_LAST, TO_NODE = range(4)
-# Places in Injection.state
-SUPPLY_SHARE, JITTER_S, ALIEN_BITS, ROOM_BITS = range(4)
+# Columns of Injection.plan
+KIND, TARGET, FIRST, LAST, STUCK_AT = range(5)
+# Rows and columns of Injection.table
+FIRST_SENSOR = len(FRAMES)
+VALVES_SYNC = FIRST_SENSOR + len(SENSORS)
+MOTION_REQUEST = VALVES_SYNC + 1
+ID, START, LENGTH, SIGNED, LOW, HIGH, INVALID_RAW = range(7)
+# First rows of each part of Injection.row
+RECOVERY_ROWS = 3
+_HELD = RECOVERY_ROWS
+_FRESH = _HELD + HELD_MOST
+_TO_NODE = _FRESH + FRESH_MOST
+_ROWS = _TO_NODE + FRESH_MOST
+# Places in Injection.number; from STEPS on the sensors' steps
+SUPPLY_SHARE, JITTER_S, ALIEN_BITS, ROOM_BITS, STEPS = range(5)
 # Places in Injection.count
-MOTION_COUNTER, RECOVER_NEXT, RECOVER_SINCE = range(3)
+MOTION_COUNTER, RECOVER_NEXT = range(2)
 
 
 class Injection(NamedTuple):
-    """The faults of a run, one row each, and their state; no rows: none of this is looked at.
+    """The faults of a run and their state; no rows in ``plan``: none of this is looked at.
+
+    Few arrays, because compiled code hands all of them on with every call.
 
     Attributes
     ----------
-    kind, target, first, last : np.ndarray
-        Code; one bit per frame or sensor it strikes; the first tick, and the first one after it.
+    plan : np.ndarray
+        One row per fault: kind, target (a bit per frame or sensor), first tick, first tick after it, and the raw
+        value a stuck sensor is stuck at.
     size : np.ndarray
         In the unit of the kind; times in ticks.
     recover : np.ndarray
         Ticks at which the master begins to bring the ECU back to RUN, in order.
-    controller : int
-        The law it asks for then.
-    seed : int
-        Of everything that is left to chance.
-    frame_ids : np.ndarray
-        Of ``faults.FRAMES``.
-    sensor_id, sensor_field, sensor_step, sensor_low, sensor_high, sensor_invalid : np.ndarray
-        Of ``faults.SENSORS``: frame, bit field, SI value of a raw step, limits and invalid mark of the raw value.
-    valves_sync : np.ndarray
-        Bit field of the SYNC counter in VALVES.
+    table : np.ndarray
+        What the DBC says: a row per ``faults.FRAMES`` (identifier), then one per ``faults.SENSORS`` (identifier, bit
+        field, limits and invalid mark of the raw value), then two bit fields: SYNC counter in VALVES, request in
+        MOTION.
+    number, count : np.ndarray
+        State, named by the constants above; ``number`` ends with the SI value of a raw step of each sensor.
+    row : np.ndarray
+        Frame rows: the master's three that recover, those held, those of this tick, those for the node.
+    held : np.ndarray
+        Of each row held: the tick it is due in, and where it goes.
+    seed, wrong_hash : int
+        Of chance; a DBC hash that is not ours.
     bits_per_tick : float
         What the bus can carry.
-    wrong_hash : int
-        A DBC hash that is not ours.
-    state, count : np.ndarray
-        Numbers named by the constants above.
-    memory : np.ndarray
-        Raw value each stuck sensor is stuck at.
-    held, held_due, held_route : np.ndarray
-        Frames that wait, the tick they are due in, and where they go.
-    fresh, to_node : np.ndarray
-        Frames of this tick before the faults, and those for the node after them.
     """
 
-    kind: np.ndarray
-    target: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
+    plan: np.ndarray
     size: np.ndarray
     recover: np.ndarray
-    controller: int
-    seed: int
-    frame_ids: np.ndarray
-    sensor_id: np.ndarray
-    sensor_field: np.ndarray
-    sensor_step: np.ndarray
-    sensor_low: np.ndarray
-    sensor_high: np.ndarray
-    sensor_invalid: np.ndarray
-    valves_sync: np.ndarray
-    bits_per_tick: float
-    wrong_hash: int
-    state: np.ndarray
+    table: np.ndarray
+    number: np.ndarray
     count: np.ndarray
-    memory: np.ndarray
+    row: np.ndarray
     held: np.ndarray
-    held_due: np.ndarray
-    held_route: np.ndarray
-    fresh: np.ndarray
-    to_node: np.ndarray
+    seed: int
+    wrong_hash: int
+    bits_per_tick: float
 
 
 # frame and signal of each of faults.SENSORS
@@ -156,7 +149,7 @@ def _target_bits(kind: str, target: str) -> int:
 
 
 def make_injection(
-    faults: tuple[Fault, ...], motion_tick: int, period_s: float, seed: int, controller: int
+    faults: tuple[Fault, ...], motion_tick: int, period_s: float, seed: int, recovery: np.ndarray
 ) -> Injection:
     """Faults for compiled code.
 
@@ -170,46 +163,44 @@ def make_injection(
         The tick.
     seed : int
         Of the run.
-    controller : int
-        The law that the master asks for when it brings the ECU back to RUN.
+    recovery : np.ndarray
+        The master's frames that bring the ECU back: for INIT, for STANDBY, for FAULT; shape (3, 16).
     """
-    n = len(faults)
-    first = np.array([motion_tick + round(f.start_s / period_s) for f in faults], dtype=np.int64)
-    ticks = np.array([max(1, round(f.duration_s / period_s)) for f in faults], dtype=np.int64)
-    ends = zip(faults, first + ticks, strict=True)
-    recover = sorted(int(end) + round(f.recover_after_s / period_s) for f, end in ends if f.recover_after_s is not None)
-    size = [f.size * 1e-3 / period_s if f.kind == "delayed" else f.size for f in faults]
-    signals = [protocol.database().get_message_by_name(m).get_signal_by_name(s) for m, s in _SIGNALS.values()]
-    invalid = [65535 if not s.is_signed else -(1 << (s.length - 1)) for s in signals]
-    state = np.zeros(4)
-    state[SUPPLY_SHARE] = 1.0
+    plan = np.zeros((len(faults), 5), dtype=np.int64)
+    recover = []
+    for n, fault in enumerate(faults):
+        first = motion_tick + round(fault.start_s / period_s)
+        last = first + max(1, round(fault.duration_s / period_s))
+        plan[n] = KINDS[fault.kind].code, _target_bits(fault.kind, fault.target), first, last, _NOT_SEEN
+        if fault.recover_after_s is not None:
+            recover.append(last + round(fault.recover_after_s / period_s))
+    table = np.zeros((MOTION_REQUEST + 1, 7), dtype=np.int64)
+    table[: len(FRAMES), ID] = [protocol.frame_id(name.upper()) for name in FRAMES]
+    number = np.zeros(STEPS + len(SENSORS))
+    number[SUPPLY_SHARE] = 1.0
+    for k, (message, name) in enumerate(_SIGNALS.values()):
+        signal = protocol.database().get_message_by_name(message).get_signal_by_name(name)
+        start, length, signed = protocol.layout(message, (name,))[0].tolist()
+        invalid = -(1 << (length - 1)) if signed else (1 << length) - 1
+        low, high = (invalid + 1, -invalid - 1) if signed else (0, invalid - 1)
+        table[FIRST_SENSOR + k] = protocol.frame_id(message), start, length, signed, low, high, invalid
+        number[STEPS + k] = float(signal.scale) * _SI_OF_UNIT[signal.unit]
+    table[VALVES_SYNC, START : SIGNED + 1] = protocol.layout("VALVES", ("SyncCounter",))[0]
+    table[MOTION_REQUEST, START : SIGNED + 1] = protocol.layout("MOTION", ("Request",))[0]
+    row = np.zeros((_ROWS, FRAME_BYTES), dtype=np.uint8)
+    row[:RECOVERY_ROWS] = recovery
     return Injection(
-        kind=np.array([KINDS[f.kind].code for f in faults], dtype=np.int64),
-        target=np.array([_target_bits(f.kind, f.target) for f in faults], dtype=np.int64),
-        first=first,
-        last=first + ticks,
-        size=np.array(size, dtype=np.float64),
-        recover=np.array(recover, dtype=np.int64),
-        controller=controller,
+        plan=plan,
+        size=np.array([f.size * 1e-3 / period_s if f.kind == "delayed" else f.size for f in faults], dtype=np.float64),
+        recover=np.array(sorted(recover), dtype=np.int64),
+        table=table,
+        number=number,
+        count=np.zeros(2, dtype=np.int64),
+        row=row,
+        held=np.zeros((HELD_MOST, 2), dtype=np.int64),
         seed=seed,
-        frame_ids=np.array([protocol.frame_id(name.upper()) for name in FRAMES], dtype=np.int64),
-        sensor_id=np.array([protocol.frame_id(m) for m, _ in _SIGNALS.values()], dtype=np.int64),
-        sensor_field=np.array([protocol.layout(m, (s,))[0] for m, s in _SIGNALS.values()], dtype=np.int64),
-        sensor_step=np.array([float(s.scale) * _SI_OF_UNIT[s.unit] for s in signals]),
-        sensor_low=np.array([i + 1 if s.is_signed else 0 for s, i in zip(signals, invalid, strict=True)]),
-        sensor_high=np.array([-i - 1 if s.is_signed else i - 1 for s, i in zip(signals, invalid, strict=True)]),
-        sensor_invalid=np.array(invalid, dtype=np.int64),
-        valves_sync=protocol.layout("VALVES", ("SyncCounter",)),
-        bits_per_tick=protocol.BIT_RATE * period_s,
         wrong_hash=protocol.dbc_hash() ^ 1,
-        state=state,
-        count=np.zeros(3, dtype=np.int64),
-        memory=np.full(n, _NOT_SEEN, dtype=np.int64),
-        held=np.zeros((HELD_MOST, FRAME_BYTES), dtype=np.uint8),
-        held_due=np.zeros(HELD_MOST, dtype=np.int64),
-        held_route=np.zeros(HELD_MOST, dtype=np.int64),
-        fresh=np.zeros((FRESH_MOST, FRAME_BYTES), dtype=np.uint8),
-        to_node=np.zeros((FRESH_MOST, FRAME_BYTES), dtype=np.uint8),
+        bits_per_tick=protocol.BIT_RATE * period_s,
     )
 
 
@@ -230,14 +221,14 @@ def draw(seed: int, fault: int, tick: int, place: int) -> float:
 @njit(cache=True)
 def under_way(injection: Injection, fault: int, tick: int) -> bool:
     """True while a fault lasts."""
-    return injection.first[fault] <= tick < injection.last[fault]
+    return injection.plan[fault, FIRST] <= tick < injection.plan[fault, LAST]
 
 
 @njit(cache=True)
 def any_of(injection: Injection, kind: int, tick: int) -> bool:
     """True while a fault of this kind lasts."""
-    for n in range(injection.kind.size):
-        if injection.kind[n] == kind and under_way(injection, n, tick):
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == kind and under_way(injection, n, tick):
             return True
     return False
 
@@ -245,10 +236,10 @@ def any_of(injection: Injection, kind: int, tick: int) -> bool:
 @njit(cache=True)
 def starved(injection: Injection, tick: int) -> bool:
     """True while foreign frames of higher priority leave not even SYNC a place."""
-    for n in range(injection.kind.size):
+    for n in range(injection.plan.shape[0]):
         if (
-            injection.kind[n] == ALIEN_TRAFFIC
-            and injection.target[n] == 1
+            injection.plan[n, KIND] == ALIEN_TRAFFIC
+            and injection.plan[n, TARGET] == 1
             and under_way(injection, n, tick)
             and (1.0 - injection.size[n]) * injection.bits_per_tick < _SYNC_BITS
         ):
@@ -268,8 +259,8 @@ def transmit_room(injection: Injection, tick: int, most: int) -> int:
     if nothing_from_ecu(injection, tick):
         return 0
     room = most
-    for n in range(injection.kind.size):
-        if injection.kind[n] == SEND_QUEUE_FULL and under_way(injection, n, tick):
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == SEND_QUEUE_FULL and under_way(injection, n, tick):
             room = min(room, int(injection.size[n]))
     return room
 
@@ -279,8 +270,12 @@ def sync_reaches_node(injection: Injection, tick: int) -> bool:
     """False when the SYNC of this tick gets lost, or nobody is there to hear it."""
     if any_of(injection, NODE_KILLED, tick) or nothing_from_ecu(injection, tick):
         return False
-    for n in range(injection.kind.size):
-        if injection.kind[n] == DROPPED and injection.target[n] == 1 << SYNC and under_way(injection, n, tick):
+    for n in range(injection.plan.shape[0]):
+        if (
+            injection.plan[n, KIND] == DROPPED
+            and injection.plan[n, TARGET] == 1 << SYNC
+            and under_way(injection, n, tick)
+        ):
             if draw(injection.seed, n, tick, SYNC) < injection.size[n]:
                 return False
     return True
@@ -295,22 +290,22 @@ _AFTER_P_SUPPLY = _P_SUPPLY + 1
 @njit(cache=True)
 def plant_now(injection: Injection, plant: PlantParameters, tick: int, period_s: float) -> PlantParameters:
     """The plant with the supply pressure it has in this tick; to be called once a tick."""
-    share, goal, time_s = injection.state[SUPPLY_SHARE], 1.0, 0.0
-    for n in range(injection.kind.size):
-        if injection.kind[n] == SUPPLY_LOST and injection.first[n] <= tick:
+    share, goal, time_s = injection.number[SUPPLY_SHARE], 1.0, 0.0
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == SUPPLY_LOST and injection.plan[n, FIRST] <= tick:
             time_s = injection.size[n]
-            goal = plant.p_tank / plant.p_supply if tick < injection.last[n] else 1.0
+            goal = plant.p_tank / plant.p_supply if tick < injection.plan[n, LAST] else 1.0
     if time_s > 0.0:
         share += (goal - share) * (1.0 - math.exp(-period_s / time_s))
-        injection.state[SUPPLY_SHARE] = share
+        injection.number[SUPPLY_SHARE] = share
     return PlantParameters(*(plant[:_P_SUPPLY] + (plant.p_supply * share,) + plant[_AFTER_P_SUPPLY:]))  # noqa: RUF005
 
 
 @njit(cache=True)
 def load_now(injection: Injection, load_kg: float, tick: int) -> float:
     """The load in this tick."""
-    for n in range(injection.kind.size):
-        if injection.kind[n] == LOAD_DROPPED and under_way(injection, n, tick):
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == LOAD_DROPPED and under_way(injection, n, tick):
             load_kg = min(load_kg, injection.size[n])
     return load_kg
 
@@ -319,11 +314,11 @@ def load_now(injection: Injection, load_kg: float, tick: int) -> float:
 def timing_now(injection: Injection, timing: NodeTiming, tick: int) -> NodeTiming:
     """Times of the node from the last SYNC to this one; to be called once a tick."""
     jitter_s = 0.0
-    for n in range(injection.kind.size):
-        if injection.kind[n] == SYNC_JITTER and under_way(injection, n, tick):
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == SYNC_JITTER and under_way(injection, n, tick):
             jitter_s = injection.size[n] * (2.0 * draw(injection.seed, n, tick, 0) - 1.0)
-    before_s = injection.state[JITTER_S]
-    injection.state[JITTER_S] = jitter_s
+    before_s = injection.number[JITTER_S]
+    injection.number[JITTER_S] = jitter_s
     return NodeTiming(
         timing.period_s + jitter_s - before_s, timing.delay_s, timing.timeout_ticks, timing.heartbeat_ticks
     )
@@ -337,22 +332,22 @@ def disturb_sensors(injection: Injection, tick: int, row: np.ndarray) -> None:
     """What is wrong with the sensors in a frame that the node has packed; its protection stays right."""
     can_id = frame_id(row)
     changed = False
-    for n in range(injection.kind.size):
-        kind = injection.kind[n]
+    for n in range(injection.plan.shape[0]):
+        kind = injection.plan[n, KIND]
         if kind < STUCK or kind > INVALID or not under_way(injection, n, tick):
             continue
-        for sensor in range(injection.sensor_id.size):
-            if injection.sensor_id[sensor] != can_id or not (injection.target[n] >> sensor) & 1:
+        for sensor in range(VALVES_SYNC - FIRST_SENSOR):
+            field = injection.table[FIRST_SENSOR + sensor]
+            if field[ID] != can_id or not (injection.plan[n, TARGET] >> sensor) & 1:
                 continue
-            start, length = injection.sensor_field[sensor, 0], injection.sensor_field[sensor, 1]
-            raw = get(row, start, length, injection.sensor_field[sensor, 2])
-            step, size = injection.sensor_step[sensor], injection.size[n]
+            raw = get(row, field[START], field[LENGTH], field[SIGNED])
+            step, size = injection.number[STEPS + sensor], injection.size[n]
             if kind == STUCK:
-                if injection.memory[n] == _NOT_SEEN:
-                    injection.memory[n] = raw
-                raw = injection.memory[n]
+                if injection.plan[n, STUCK_AT] == _NOT_SEEN:
+                    injection.plan[n, STUCK_AT] = raw
+                raw = injection.plan[n, STUCK_AT]
             elif kind == INVALID:
-                raw = injection.sensor_invalid[sensor]
+                raw = field[INVALID_RAW]
             else:
                 value = raw * step
                 if kind == BIASED:
@@ -361,8 +356,8 @@ def disturb_sensors(injection: Injection, tick: int, row: np.ndarray) -> None:
                     value += size * (2.0 * draw(injection.seed, n, tick, 0) - 1.0)
                 elif draw(injection.seed, n, tick, 0) < SPIKE_CHANCE:
                     value += size if draw(injection.seed, n, tick, 1) < 0.5 else -size
-                raw = quantise(value, step, injection.sensor_low[sensor], injection.sensor_high[sensor])
-            put(row, start, length, raw)
+                raw = quantise(value, step, field[LOW], field[HIGH])
+            put(row, field[START], field[LENGTH], raw)
             changed = True
     if changed:
         protect(row, row[DATA + 1] & 0x0F)
@@ -382,10 +377,10 @@ def copy_row(source: np.ndarray, target: np.ndarray) -> None:
 def hold(injection: Injection, row: np.ndarray, due: int, route: int) -> None:
     """Keep a frame until it is due."""
     for slot in range(HELD_MOST):
-        if injection.held_route[slot] == FREE:
-            copy_row(row, injection.held[slot])
-            injection.held_due[slot] = due
-            injection.held_route[slot] = route
+        if injection.held[slot, 1] == FREE:
+            copy_row(row, injection.row[_HELD + slot])
+            injection.held[slot, 0] = due
+            injection.held[slot, 1] = route
             return
 
 
@@ -393,9 +388,9 @@ def hold(injection: Injection, row: np.ndarray, due: int, route: int) -> None:
 def release(injection: Injection, tick: int, route: int, out: np.ndarray, rows: int) -> int:
     """Append the frames that are due on a route to ``out``; the rows in it then."""
     for slot in range(HELD_MOST):
-        if injection.held_route[slot] == route and injection.held_due[slot] <= tick and rows < out.shape[0]:
-            copy_row(injection.held[slot], out[rows])
-            injection.held_route[slot] = FREE
+        if injection.held[slot, 1] == route and injection.held[slot, 0] <= tick and rows < out.shape[0]:
+            copy_row(injection.row[_HELD + slot], out[rows])
+            injection.held[slot, 1] = FREE
             rows += 1
     return rows
 
@@ -405,25 +400,25 @@ def send_disturbed(injection: Injection, tick: int, row: np.ndarray, out: np.nda
     """Append to ``out`` what arrives of a frame; the rows in it then. Changes ``row``."""
     which = -1
     for k in range(SYNC):
-        if injection.frame_ids[k] == frame_id(row):
+        if injection.table[k, ID] == frame_id(row):
             which = k
-    to_node = which == VALVES
+    valves = which == VALVES
     copies = 1
     if which >= 0:
-        for n in range(injection.kind.size):
-            kind = injection.kind[n]
-            if kind > OLD_COUNTER or not (injection.target[n] >> which) & 1 or not under_way(injection, n, tick):
+        for n in range(injection.plan.shape[0]):
+            kind = injection.plan[n, KIND]
+            if kind > OLD_COUNTER or not (injection.plan[n, TARGET] >> which) & 1 or not under_way(injection, n, tick):
                 continue
             size = int(injection.size[n])
             if kind == DROPPED:
                 if draw(injection.seed, n, tick, which) < injection.size[n]:
                     return rows
             elif kind == DELAYED:
-                hold(injection, row, tick + size, TO_NODE if to_node else TO_ECU_FIRST)
+                hold(injection, row, tick + size, TO_NODE if valves else TO_ECU_FIRST)
                 return rows
             elif kind == REORDERED:
-                if (tick - injection.first[n]) % 2 == 0:  # comes after the next one
-                    hold(injection, row, tick + 1, TO_NODE if to_node else TO_ECU_LAST)
+                if (tick - injection.plan[n, FIRST]) % 2 == 0:  # comes after the next one
+                    hold(injection, row, tick + 1, TO_NODE if valves else TO_ECU_LAST)
                     return rows
             elif kind == REPEATED:
                 copies += size
@@ -439,8 +434,8 @@ def send_disturbed(injection: Injection, tick: int, row: np.ndarray, out: np.nda
                 row[0] = size & 0xFF
                 row[1] = size >> 8
             elif kind == OLD_COUNTER:
-                if to_node:  # an old answer: to an old SYNC
-                    start, length = injection.valves_sync[0, 0], injection.valves_sync[0, 1]
+                if valves:  # an old answer: to an old SYNC
+                    start, length = injection.table[VALVES_SYNC, START], injection.table[VALVES_SYNC, LENGTH]
                     put(row, start, length, (get(row, start, length, 0) - 1 - size) % 240 + 1)
                 protect(row, (int(row[DATA + 1] & 0x0F) - size) % E2E_STATES)
     for _ in range(copies):
@@ -457,27 +452,27 @@ def foreign_frames(injection: Injection, tick: int, priority: int, out: np.ndarr
     Those of higher priority take their share of the bus from ours, ``state[ROOM_BITS]``; those of lower priority get
     what ours leave.
     """
-    for n in range(injection.kind.size):
+    for n in range(injection.plan.shape[0]):
         if (
-            injection.kind[n] != ALIEN_TRAFFIC
-            or injection.target[n] != 1 << priority
+            injection.plan[n, KIND] != ALIEN_TRAFFIC
+            or injection.plan[n, TARGET] != 1 << priority
             or not under_way(injection, n, tick)
         ):
             continue
         bits = injection.size[n] * injection.bits_per_tick
         if priority == 0:
-            injection.state[ROOM_BITS] -= bits
+            injection.number[ROOM_BITS] -= bits
         else:
             bits = min(bits, max(injection.bits_per_tick - _OUR_BITS, 0.0))
-        injection.state[ALIEN_BITS] += bits
+        injection.number[ALIEN_BITS] += bits
         place = 0
         low, high = (_HIGH_FIRST, _HIGH_LAST) if priority == 0 else (_LOW_FIRST, _LOW_LAST)
         while rows < out.shape[0]:
             length = int(9.0 * draw(injection.seed, n, tick, place))
             needed = 8 * length + 47 + (33 + 8 * length) // 4  # protocol.worst_case_bits
-            if injection.state[ALIEN_BITS] < needed:
+            if injection.number[ALIEN_BITS] < needed:
                 break
-            injection.state[ALIEN_BITS] -= needed
+            injection.number[ALIEN_BITS] -= needed
             can_id = low + int((high - low + 1) * draw(injection.seed, n, tick, place + 1))
             write_header(out[rows], can_id, length)
             for k in range(length):
@@ -490,10 +485,10 @@ def foreign_frames(injection: Injection, tick: int, priority: int, out: np.ndarr
 @njit(cache=True)
 def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np.ndarray, rows: int) -> int:
     """Append what others send in this tick that should not: network management, a second ECU; the rows then."""
-    for n in range(injection.kind.size):
+    for n in range(injection.plan.shape[0]):
         if not under_way(injection, n, tick):
             continue
-        kind = injection.kind[n]
+        kind = injection.plan[n, KIND]
         if kind in (NMT_STOP, NMT_RESET):
             write_header(out[rows], 0, 2)
             out[rows, DATA] = 2 if kind == NMT_STOP else 129
@@ -506,11 +501,11 @@ def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np
             put(out[rows], 32, 32, injection.wrong_hash)
             rows += 1
         elif kind == SECOND_ECU:
-            write_header(out[rows], injection.frame_ids[VALVES], 8)
-            put(out[rows], injection.valves_sync[0, 0], injection.valves_sync[0, 1], sync_counter)
+            write_header(out[rows], injection.table[VALVES, ID], 8)
+            put(out[rows], injection.table[VALVES_SYNC, START], injection.table[VALVES_SYNC, LENGTH], sync_counter)
             protect(out[rows], (tick + FOREIGN_COUNTER_AHEAD) % E2E_STATES)
             rows += 1
-            since = tick - injection.first[n]
+            since = tick - injection.plan[n, FIRST]
             if since % HEARTBEAT_TICKS == 0:
                 write_header(out[rows], _HEARTBEAT_ECU, 1)
                 out[rows, DATA] = 0 if since == 0 else 5
@@ -520,30 +515,60 @@ def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np
 
 @njit(cache=True)
 def disturb_answer(injection: Injection, tick: int, rows: int, out: np.ndarray) -> int:
-    """Write to ``out`` what reaches the ECU of the ``rows`` frames in ``injection.fresh``; the rows in it."""
-    injection.state[ROOM_BITS] = injection.bits_per_tick - _SYNC_BITS
+    """Write to ``out`` what reaches the ECU of the ``rows`` frames in :func:`fresh`; the rows in it."""
+    injection.number[ROOM_BITS] = injection.bits_per_tick - _SYNC_BITS
     arrived = foreign_frames(injection, tick, 0, out, 0)
     arrived = release(injection, tick, TO_ECU_FIRST, out, arrived)
     for k in range(rows):
-        row = injection.fresh[k]
+        row = injection.row[_FRESH + k]
         disturb_sensors(injection, tick, row)
-        if injection.state[ROOM_BITS] < _FRAME_BITS:  # the next tick, too late for this one
+        if injection.number[ROOM_BITS] < _FRAME_BITS:  # the next tick, too late for this one
             hold(injection, row, tick + 1, TO_ECU_FIRST)
             continue
-        injection.state[ROOM_BITS] -= _FRAME_BITS
+        injection.number[ROOM_BITS] -= _FRAME_BITS
         arrived = send_disturbed(injection, tick, row, out, arrived)
     arrived = release(injection, tick, TO_ECU_LAST, out, arrived)
     return foreign_frames(injection, tick, 1, out, arrived)
 
 
 @njit(cache=True)
+def fresh(injection: Injection) -> np.ndarray:
+    """Rows for the frames of this tick, before the faults."""
+    return injection.row[_FRESH:_TO_NODE]
+
+
+@njit(cache=True)
+def to_node(injection: Injection) -> np.ndarray:
+    """Rows for the valve frames that reach the node, after the faults."""
+    return injection.row[_TO_NODE:]
+
+
+@njit(cache=True)
 def disturb_valves(injection: Injection, tick: int, row: np.ndarray) -> int:
-    """Write to ``injection.to_node`` what reaches the node of a valve frame; the rows in it."""
+    """Write to :func:`to_node` what reaches the node of a valve frame; the rows in it."""
     if any_of(injection, NODE_KILLED, tick):
         return 0
-    if injection.state[ROOM_BITS] < _FRAME_BITS and any_of(injection, ALIEN_TRAFFIC, tick):
+    if injection.number[ROOM_BITS] < _FRAME_BITS and any_of(injection, ALIEN_TRAFFIC, tick):
         hold(injection, row, tick + 1, TO_NODE)
         return 0
-    injection.state[ROOM_BITS] -= _FRAME_BITS
-    copy_row(row, injection.fresh[0])
-    return send_disturbed(injection, tick, injection.fresh[0], injection.to_node, 0)
+    injection.number[ROOM_BITS] -= _FRAME_BITS
+    copy_row(row, injection.row[_FRESH])
+    return send_disturbed(injection, tick, injection.row[_FRESH], to_node(injection), 0)
+
+
+@njit(cache=True)
+def late_valves(injection: Injection, tick: int) -> int:
+    """Write to :func:`to_node` the valve frames held until this tick; the rows in it."""
+    return release(injection, tick, TO_NODE, to_node(injection), 0)
+
+
+@njit(cache=True)
+def is_motion(injection: Injection, row: np.ndarray) -> bool:
+    """True for a command of the master."""
+    return frame_id(row) == injection.table[MOTION, ID]
+
+
+@njit(cache=True)
+def request_of(injection: Injection, row: np.ndarray) -> int:
+    """What a command of the master asks for."""
+    return get(row, injection.table[MOTION_REQUEST, START], injection.table[MOTION_REQUEST, LENGTH], 0)

@@ -17,8 +17,10 @@ from sil_plant.session import (
     TICK,
     Session,
     ecu_is_dead,
-    on_frame,
-    on_sync,
+    on_frame_plain,
+    on_frame_with_faults,
+    on_sync_plain,
+    on_sync_with_faults,
     restarts,
     transmit_room,
     without_sync,
@@ -135,6 +137,27 @@ def closed_loop(
 ) -> int:
     """Run ECU and session together for ``ticks`` ticks, or until the run is over; the ticks done."""
     for done in range(ticks):
+        sent = begin(ecu, np.uintp(tx.ctypes.data), np.int32(TX_ROWS))
+        rows = 0
+        for k in range(sent):
+            if frame_id(tx[k]) == SYNC_ID:
+                rows = on_sync_plain(session, int(tx[k, 5]), rx)
+            else:
+                on_frame_plain(session, tx[k])
+        if rows < 0:
+            return done
+        sent = end(ecu, np.uintp(rx.ctypes.data), np.int32(rows), np.uintp(tx.ctypes.data), np.int32(TX_ROWS))
+        for k in range(sent):
+            on_frame_plain(session, tx[k])
+    return ticks
+
+
+@njit(cache=True)
+def closed_loop_with_faults(
+    session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
+) -> int:
+    """As :func:`closed_loop`, with an ECU that may be dead, or unable to send."""
+    for done in range(ticks):
         if ecu_is_dead(session):
             if without_sync(session, rx) < 0:
                 return done
@@ -146,17 +169,17 @@ def closed_loop(
         synchronous = False
         for k in range(sent):
             if frame_id(tx[k]) == SYNC_ID:
-                rows = on_sync(session, int(tx[k, 5]), rx)
+                rows = on_sync_with_faults(session, int(tx[k, 5]), rx)
                 synchronous = True
             else:
-                on_frame(session, tx[k])
+                on_frame_with_faults(session, tx[k])
         if not synchronous:
             rows = without_sync(session, rx)
         if rows < 0:
             return done
         sent = end(ecu, np.uintp(rx.ctypes.data), np.int32(rows), np.uintp(tx.ctypes.data), np.int32(room))
         for k in range(sent):
-            on_frame(session, tx[k])
+            on_frame_with_faults(session, tx[k])
     return ticks
 
 
@@ -167,7 +190,8 @@ def run_inproc(session: Session, ecu: InprocEcu, ticks: int) -> int:
     first = int(session.progress.index[TICK])
     done = 0
     for stop in [tick - first for tick in restarts(session) if first < tick <= first + ticks] + [ticks]:
-        done += int(closed_loop(session, ecu.begin, ecu.end, np.uintp(ecu.pointer), stop - done, rx, tx))
+        loop = closed_loop_with_faults if session.faulty else closed_loop
+        done += int(loop(session, ecu.begin, ecu.end, np.uintp(ecu.pointer), stop - done, rx, tx))
         if done < stop:
             break
         if first + stop in restarts(session):

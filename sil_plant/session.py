@@ -24,10 +24,10 @@ from sil_plant.io_node import (
     NodeLayout,
     NodeTiming,
     advance_one_period,
-    heartbeat_row,
     make_node,
     node_errors,
     node_frame,
+    node_heartbeat,
     node_layout,
     node_sync,
     node_timing,
@@ -43,7 +43,8 @@ PARKED_S = 0.25  # with the pump off, where the pressures are tared
 CONTROLLERS = ("pid", "diarc-noload", "diarc")
 
 ECU_NODE, IO_NODE = 1, 2
-NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129
+NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129  # commands
+NMT_STOPPED, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 4, 5, 127  # states
 REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE, REQUEST_RESET_FAULT, REQUEST_TARE = 1, 2, 3, 4, 5
 MODE_NAMES = {
     0: "INIT",
@@ -97,7 +98,8 @@ RECOVER_TICKS_MOST = 2000  # then it gives up
     EMERGENCIES,
     REBOOTS,
     OUTSIDE,
-) = range(15)
+    NMT_STATE,
+) = range(16)
 
 
 class Timeline(NamedTuple):
@@ -117,14 +119,11 @@ class MonitorLayout(NamedTuple):
     timing_id: int
     emergency_id: int
     valves_id: int
-    motion_id: int
     heartbeat_id: int
     estimate: np.ndarray
     tracking: np.ndarray
     timing: np.ndarray
     emergency: np.ndarray
-    valves: np.ndarray
-    motion: np.ndarray
     load_step: float
     sd_step: float
     angle_step: float
@@ -156,7 +155,6 @@ class Schedule(NamedTuple):
     move_ticks: np.ndarray
     load_tick: np.ndarray
     load_kg: np.ndarray
-    recover_row: np.ndarray  # NMT start, RUN, RESET_FAULT: what brings the ECU back
 
 
 class Record(NamedTuple):
@@ -169,9 +167,7 @@ class Record(NamedTuple):
     load_est: np.ndarray
     load_sd: np.ndarray
     mode: np.ndarray
-    fault: np.ndarray  # code of the last emergency
-    sent: np.ndarray  # (ticks, 2), spool set-points as the ECU sent them last, 0 when disabled
-    in_effect: np.ndarray  # (ticks, 2), set-points that the valves had since the tick before
+    valves: np.ndarray  # (ticks, 4), spool set-points in effect since the tick before; last sent, 0 when disabled
     emergency: np.ndarray  # (EMERGENCIES_MOST, 3): tick, error code, fault code; whole[EMERGENCIES] of them
 
 
@@ -197,8 +193,8 @@ class Session(NamedTuple):
     progress: Progress
     record: Record
     noise: np.ndarray
-    heartbeat: np.ndarray  # the node's, a frame row
     injection: Injection
+    faulty: bool  # the injection has rows; a scalar, because looking into a tuple of arrays takes time
 
 
 TICK, NEXT_FRAME, NEXT_MOVE, NEXT_LOAD = range(4)
@@ -214,7 +210,6 @@ def monitor_layout() -> MonitorLayout:
         timing_id=protocol.frame_id("TIMING"),
         emergency_id=protocol.frame_id("EMCY_ECU"),
         valves_id=protocol.frame_id("VALVES"),
-        motion_id=protocol.frame_id("MOTION"),
         heartbeat_id=protocol.frame_id("HEARTBEAT_ECU"),
         estimate=protocol.layout("ESTIMATE", ("Load", "LoadSd", "Mode")),
         tracking=protocol.layout("TRACKING", ("TrackingJoint", "SwingReference", "WristReference")),
@@ -233,8 +228,6 @@ def monitor_layout() -> MonitorLayout:
             ),
         ),
         emergency=protocol.layout("EMCY_ECU", ("ErrorCode", "FaultCode")),
-        valves=protocol.layout("VALVES", ("SwingSpool", "WristSpool", "SwingControl", "WristControl")),
-        motion=protocol.layout("MOTION", ("Request",)),
         load_step=protocol.scale("ESTIMATE", "Load"),
         sd_step=protocol.scale("ESTIMATE", "LoadSd"),
         angle_step=protocol.scale("TRACKING", "SwingReference"),
@@ -319,14 +312,18 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
         move_ticks=np.array(move_ticks, dtype=np.int64),
         load_tick=np.array(load_tick, dtype=np.int64),
         load_kg=np.array([step.load_kg for step in scenario.load]),
-        recover_row=np.array(
-            [
-                nmt_frame(NMT_START, node=0),
-                motion_frame(0, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
-                motion_frame(0, REQUEST_RESET_FAULT),
-            ],
-            dtype=np.uint8,
-        ),
+    )
+
+
+def recovery_frames(controller: str) -> np.ndarray:
+    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT; shape (3, 16)."""
+    return np.array(
+        [
+            nmt_frame(NMT_START, node=0),
+            motion_frame(0, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
+            motion_frame(0, REQUEST_RESET_FAULT),
+        ],
+        dtype=np.uint8,
     )
 
 
@@ -393,7 +390,7 @@ def make_session(
         timeline=timeline,
         monitor_layout=monitor_layout(),
         monitor=Monitor(
-            whole=np.zeros(15, dtype=np.int64),
+            whole=np.zeros(16, dtype=np.int64),
             load=np.zeros(2),
             reference=np.zeros(2),
             sent=np.zeros(2),
@@ -410,16 +407,14 @@ def make_session(
             load_est=np.zeros(ticks),
             load_sd=np.zeros(ticks),
             mode=np.zeros(ticks, dtype=np.int64),
-            fault=np.zeros(ticks, dtype=np.int64),
-            sent=np.zeros((ticks, 2)),
-            in_effect=np.zeros((ticks, 2)),
+            valves=np.zeros((ticks, 4)),
             emergency=np.zeros((EMERGENCIES_MOST, 3), dtype=np.int64),
         ),
         noise=sensor_noise(plant_machine, seed, ticks),
-        heartbeat=heartbeat_row(),
         injection=injection.make_injection(
-            scenario.faults, timeline.motion, period_s, seed, CONTROLLERS.index(controller)
+            scenario.faults, timeline.motion, period_s, seed, recovery_frames(controller)
         ),
+        faulty=bool(scenario.faults),
     )
 
 
@@ -438,7 +433,7 @@ def reference_at(start: float, target: float, elapsed: float, total: float) -> f
 def update_references(session: Session, tick: int) -> None:
     """Start the moves due at this tick and record the references."""
     schedule, index, move = session.schedule, session.progress.index, session.progress.move
-    if session.injection.kind.size > 0 and not drives(session.monitor.whole[MODE]):
+    if session.faulty and not drives(session.monitor.whole[MODE]):
         # no move goes out: what comes later starts where the ECU then holds the joint
         move[:, 3] = 0.0
         while index[NEXT_MOVE] < schedule.move_tick.size and schedule.move_tick[index[NEXT_MOVE]] <= tick:
@@ -496,18 +491,16 @@ def record_tick(session: Session, tick: int) -> None:
         record.state[tick, k] = node.y[k]
     for i in range(2):
         record.command[tick, i] = node.u[1, i]
-        record.sent[tick, i] = monitor.sent[i]
-        record.in_effect[tick, i] = node.u[0, i]
+        record.valves[tick, i] = node.u[0, i]
+        record.valves[tick, 2 + i] = monitor.sent[i]
     record.load_true[tick] = node.load[0]
     record.load_est[tick] = monitor.load[0]
     record.load_sd[tick] = monitor.load[1]
     record.mode[tick] = monitor.whole[MODE]
-    record.fault[tick] = monitor.whole[FAULT]
     update_references(session, tick)
     session.progress.index[TICK] = tick + 1
 
 
-@njit(cache=True)
 def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     """Answer SYNC: the plant moves on, the record gets a row, the answer is written to ``out``.
 
@@ -518,14 +511,22 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
         node's heartbeat when it is due; whatever faults have made of them.
         -1 when the run is over: nothing was done. 0 for a SYNC that came twice.
     """
+    return int((on_sync_with_faults if session.faulty else on_sync_plain)(session, sync_counter, out))
+
+
+def on_frame(session: Session, row: np.ndarray) -> None:
+    """Take any other frame from the bus: valve commands for the node, the rest for the monitor."""
+    (on_frame_with_faults if session.faulty else on_frame_plain)(session, row)
+
+
+@njit(cache=True)
+def on_sync_plain(session: Session, sync_counter: int, out: np.ndarray) -> int:
+    """As :func:`on_sync`, for compiled code and a session without faults."""
     tick = session.progress.index[TICK]
     if tick >= session.noise.shape[0]:
         return -1
-    if session.injection.kind.size > 0:
-        return on_sync_with_faults(session, sync_counter, out)
-    node = session.node
     load_due(session, tick)
-    if sync_counter == node.count[SYNC_LAST]:
+    if sync_counter == session.node.count[SYNC_LAST]:
         return 0  # the same SYNC again: answered already
     rows = master_frames(session, tick, out)
     rows += answer(session, session.plant, session.timing, tick, sync_counter, out[rows:])
@@ -550,8 +551,7 @@ def answer(
         out,
     )
     if tick % timing.heartbeat_ticks == 0:
-        for k in range(FRAME_BYTES):
-            out[rows, k] = session.heartbeat[k]
+        node_heartbeat(session.layout, out[rows])
         rows += 1
     return rows
 
@@ -563,6 +563,8 @@ def answer(
 def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) -> int:
     """As :func:`on_sync`, with the faults of the scenario."""
     tick = session.progress.index[TICK]
+    if tick >= session.noise.shape[0]:
+        return -1
     if sync_counter == session.node.count[SYNC_LAST]:
         return 0
     if not injection.sync_reaches_node(session.injection, tick):
@@ -570,7 +572,7 @@ def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) ->
     load_due(session, tick)
     plant = injection.plant_now(session.injection, session.plant, tick, session.timeline.period_s)
     timing = injection.timing_now(session.injection, session.timing, tick)
-    fresh = session.injection.fresh
+    fresh = injection.fresh(session.injection)
     rows = commands(session, tick, fresh)
     own = rows
     rows = injection.frames_of_others(session.injection, tick, sync_counter, fresh, rows)
@@ -581,9 +583,9 @@ def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) ->
     for k in range(own, foreign):
         node_frame(session.node, session.layout, fresh[k])  # the node hears what others send, too
     arrived = injection.disturb_answer(session.injection, tick, rows, out)
-    late = injection.release(session.injection, tick, injection.TO_NODE, session.injection.to_node, 0)
-    for k in range(late):
-        node_frame(session.node, session.layout, session.injection.to_node[k])
+    late = injection.to_node(session.injection)
+    for k in range(injection.late_valves(session.injection, tick)):
+        node_frame(session.node, session.layout, late[k])
     record_tick(session, tick)
     session.node.load[0] = load
     return arrived
@@ -616,7 +618,7 @@ def without_sync(session: Session, out: np.ndarray) -> int:
     if node.count[SYNC_LAST] > 0:
         node.count[SYNC_LAST] = node.count[SYNC_LAST] % SYNC_COUNTERS + 1
         node.count[SYNC_LOST] += 1
-    rows = commands(session, tick, session.injection.fresh)
+    rows = commands(session, tick, injection.fresh(session.injection))
     if injection.nothing_from_ecu(session.injection, tick):
         rows = 0  # nor does anything reach it
     arrived = injection.disturb_answer(session.injection, tick, rows, out)
@@ -635,8 +637,9 @@ def commands(session: Session, tick: int, out: np.ndarray) -> int:
     due = master_frames(session, tick, out)
     rows = 0
     for k in range(due):
-        if is_move(session, out[k]) and not drives(mode):
-            continue
+        if injection.is_motion(session.injection, out[k]) and not drives(mode):
+            if injection.request_of(session.injection, out[k]) == REQUEST_MOVE:
+                continue
         if k != rows:
             injection.copy_row(out[k], out[rows])
         rows += 1
@@ -644,12 +647,12 @@ def commands(session: Session, tick: int, out: np.ndarray) -> int:
     n = count[injection.RECOVER_NEXT]
     if n < recover.size and recover[n] <= tick:
         since = tick - recover[n]
-        if drives(mode) or since > RECOVER_TICKS_MOST:
+        if (drives(mode) and session.monitor.whole[NMT_STATE] == NMT_OPERATIONAL) or since > RECOVER_TICKS_MOST:
             count[injection.RECOVER_NEXT] += 1
         elif since % RECOVER_EVERY_TICKS == 0:
             rows = recovery_frame(session, mode, out, rows)
     for k in range(rows):
-        if frame_id(out[k]) == session.monitor_layout.motion_id:
+        if injection.is_motion(session.injection, out[k]):
             protect(out[k], count[injection.MOTION_COUNTER])
             count[injection.MOTION_COUNTER] = (count[injection.MOTION_COUNTER] + 1) % E2E_STATES
     return rows
@@ -658,12 +661,12 @@ def commands(session: Session, tick: int, out: np.ndarray) -> int:
 @njit(cache=True)
 def recovery_frame(session: Session, mode: int, out: np.ndarray, rows: int) -> int:
     """Append the documented procedure's next request for an ECU in this mode; the rows then."""
-    if mode == MODE_INIT:
-        injection.copy_row(session.schedule.recover_row[0], out[rows])
+    if mode == MODE_INIT or session.monitor.whole[NMT_STATE] in (NMT_STOPPED, NMT_PRE_OPERATIONAL):
+        injection.copy_row(session.injection.row[0], out[rows])
     elif mode in (MODE_STANDBY, MODE_HOLD):
-        injection.copy_row(session.schedule.recover_row[1], out[rows])
+        injection.copy_row(session.injection.row[1], out[rows])
     elif mode == MODE_FAULT:
-        injection.copy_row(session.schedule.recover_row[2], out[rows])
+        injection.copy_row(session.injection.row[2], out[rows])
     else:
         return rows  # on its way
     return rows + 1
@@ -676,52 +679,62 @@ def drives(mode: int) -> bool:
 
 
 @njit(cache=True)
-def is_move(session: Session, row: np.ndarray) -> bool:
-    """True for the command of a move."""
-    f = session.monitor_layout.motion
-    return frame_id(row) == session.monitor_layout.motion_id and get(row, f[0, 0], f[0, 1], 0) == REQUEST_MOVE
-
-
-@njit(cache=True)
 def ecu_is_dead(session: Session) -> bool:
     """True in a tick in which the ECU is killed."""
-    return session.injection.kind.size > 0 and injection.any_of(
-        session.injection, injection.ECU_KILLED, session.progress.index[TICK]
-    )
+    return injection.any_of(session.injection, injection.ECU_KILLED, session.progress.index[TICK])
 
 
 @njit(cache=True)
 def transmit_room(session: Session, most: int) -> int:
-    """Frames that the ECU's driver takes in the tick that begins."""
-    if session.injection.kind.size == 0:
-        return most
+    """Frames that the ECU's driver takes in the tick that begins, at most ``most``."""
     return injection.transmit_room(session.injection, session.progress.index[TICK], most)
 
 
 def restarts(session: Session) -> list[int]:
     """Ticks at which a killed ECU starts anew."""
-    kinds = session.injection.kind
-    return sorted(
-        {int(t) for t, kind in zip(session.injection.last, kinds, strict=True) if kind == injection.ECU_KILLED}
-    )
+    plan = session.injection.plan
+    return sorted(set(plan[plan[:, injection.KIND] == injection.ECU_KILLED, injection.LAST].tolist()))
 
 
 @njit(cache=True)
-def take_valves(session: Session, row: np.ndarray) -> None:
-    """A valve frame of the ECU: for the node what the bus and the faults leave of it, for the record as it was sent."""
-    tick = session.progress.index[TICK]
-    if tick == 0 or session.noise[tick - 1, 11] >= session.errors.frame_loss:
-        if session.injection.kind.size == 0:
-            node_frame(session.node, session.layout, row)
-        else:
-            for k in range(injection.disturb_valves(session.injection, tick - 1, row)):
-                node_frame(session.node, session.layout, session.injection.to_node[k])
-    if not intact(row):
-        return
-    f, whole = session.monitor_layout.valves, session.monitor.whole
+def hear_mode(session: Session, row: np.ndarray) -> None:
+    """The mode on an intact valve frame."""
+    whole = session.monitor.whole
     whole[MODE] = row[DATA + 1] >> 4
     if whole[MODE] == MODE_FAULT:
         whole[FAULTED] = 1
+
+
+@njit(cache=True)
+def on_frame_plain(session: Session, row: np.ndarray) -> None:
+    """As :func:`on_frame`, for compiled code and a session without faults."""
+    if frame_id(row) != session.monitor_layout.valves_id:
+        hear(session, row)
+        return
+    tick = session.progress.index[TICK]
+    if tick == 0 or session.noise[tick - 1, 11] >= session.errors.frame_loss:
+        node_frame(session.node, session.layout, row)
+    if intact(row):
+        hear_mode(session, row)
+
+
+@njit(cache=True)
+def on_frame_with_faults(session: Session, row: np.ndarray) -> None:
+    """As :func:`on_frame`, with what the bus and the faults leave of the frame; the record has it as it was sent."""
+    tick = max(session.progress.index[TICK] - 1, 0)
+    if injection.nothing_from_ecu(session.injection, tick):
+        return
+    if frame_id(row) != session.monitor_layout.valves_id:
+        hear(session, row)
+        return
+    if session.noise[tick, 11] >= session.errors.frame_loss:
+        arrived = injection.to_node(session.injection)
+        for k in range(injection.disturb_valves(session.injection, tick, row)):
+            node_frame(session.node, session.layout, arrived[k])
+    if not intact(row):
+        return
+    hear_mode(session, row)
+    f, whole = session.layout.valves, session.monitor.whole
     for i in range(2):
         command = get(row, f[i, 0], f[i, 1], 1) * session.layout.command_step
         enabled = get(row, f[2 + i, 0], f[2 + i, 1], 0) == VALVE_ACTIVE
@@ -731,17 +744,11 @@ def take_valves(session: Session, row: np.ndarray) -> None:
 
 
 @njit(cache=True)
-def on_frame(session: Session, row: np.ndarray) -> None:
-    """Take any other frame from the bus: valve commands for the node, the rest for the monitor."""
+def hear(session: Session, row: np.ndarray) -> None:
+    """What the monitor learns from a frame of the ECU."""
     layout, whole = session.monitor_layout, session.monitor.whole
-    if session.injection.kind.size > 0 and injection.nothing_from_ecu(
-        session.injection, max(session.progress.index[TICK] - 1, 0)
-    ):
-        return
     can_id = frame_id(row)
-    if can_id == layout.valves_id:
-        take_valves(session, row)
-    elif can_id == layout.emergency_id:
+    if can_id == layout.emergency_id:
         if row[4] == 8:
             take_emergency(session, row)
     elif can_id == layout.estimate_id and intact(row):
@@ -774,11 +781,13 @@ def on_frame(session: Session, row: np.ndarray) -> None:
         elif page == 3:
             whole[REFUSED] = get(row, f[7, 0], f[7, 1], 0)
             whole[LAST_REFUSAL] = get(row, f[8, 0], f[8, 1], 0)
-    elif can_id == layout.heartbeat_id and row[4] == 1 and row[DATA] == 0:  # the ECU begins anew, and counts anew
-        whole[MODE] = MODE_INIT
-        if session.node.count[SYNC_LAST] > 0:
-            session.node.count[SYNC_LAST] = SYNC_COUNTERS
-            whole[REBOOTS] += 1
+    elif can_id == layout.heartbeat_id and row[4] == 1:
+        whole[NMT_STATE] = row[DATA]
+        if row[DATA] == 0:  # the ECU begins anew, and counts anew
+            whole[MODE] = MODE_INIT
+            if session.node.count[SYNC_LAST] > 0:
+                session.node.count[SYNC_LAST] = SYNC_COUNTERS
+                whole[REBOOTS] += 1
 
 
 @njit(cache=True)

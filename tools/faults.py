@@ -60,8 +60,11 @@ def main(argv: list[str]) -> int:
         arguments.json.parent.mkdir(exist_ok=True)
         check_writable(arguments.json)
         cases = load_cases()
-        execution.compile_plant(load_machine(REFERENCE_ARM), benchmark())
         wanted = list(cells(cases, arguments.only))
+        if not wanted:
+            raise ConfigError(f"the table has no {arguments.only}; add a case to sil_plant/fault_matrix.toml")
+        for faults in ((), (wanted[0].fault,)):
+            execution.compile_plant(load_machine(REFERENCE_ARM), benchmark(faults))
         with ProcessPoolExecutor(arguments.jobs) as pool:
             rows = list(pool.map(measure, wanted, chunksize=CHUNK))
         write(arguments.json, rows)
