@@ -3,11 +3,12 @@ PYTHON := .venv/bin/python
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 MAKEFLAGS += --no-print-directory
 # compiles the plant when its sources have changed, so that no test waits for it
-COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
+COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet && \
+    $(PYTHON) sil_plant/run.py --bus inproc --scenario sil_plant/scenarios/faults.toml --quiet
 C_FILES = find firmware tests/unit tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images budget demo paper test lint format generate clean
+.PHONY: help setup firmware images budget demo paper test faults lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -48,6 +49,11 @@ test: ## every test: unit tests in C, then pytest
 	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
 	@$(PYTHON) -m pytest
+
+faults: ## break everything on purpose: the fault matrix, build/faults.json
+	@tools/setup.sh test
+	@$(MAKE) firmware
+	@$(PYTHON) tools/faults.py
 
 rules: ## MISRA C:2012: write tests/rules/misra_findings.txt and the counts in docs/misra.md
 	@tools/setup.sh test
