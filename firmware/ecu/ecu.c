@@ -215,6 +215,7 @@ static void work(struct ecu *ecu, const struct ecu_port *port)
     const enum ecu_fault wrong = samples_take(ecu);
     const bool good = wrong == FAULT_NONE;
     if (!good && !ecu->sampled) {
+        supervise_bus(ecu, port);
         return;
     }
     if (!good && !ecu->controller.armed) {
@@ -229,6 +230,7 @@ static void work(struct ecu *ecu, const struct ecu_port *port)
     request_pending(ecu);
     controller_step(&ecu->controller, &ecu->machine, &ecu->constants, &measured);
     supervise_machine(ecu, port, &before, &measured);
+    supervise_bus(ecu, port);
     operation_step(ecu);
 }
 
