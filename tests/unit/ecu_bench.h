@@ -50,7 +50,8 @@ static struct {
     int16_t spool[JOINTS];
     uint8_t status[3]; /* encoders, pressures */
     bool silent[3];
-    bool follow; /* the arm is where its reference is, and the pressures are noisy by a raw step */
+    bool follow; /* the arm is where its reference is, the spools pass what that takes, pressures are noisy */
+    bool stuck_angle[JOINTS], stuck_pressure[JOINTS][CHAMBERS]; /* while it follows */
 } sensors;
 
 static uint8_t motion_counter;
@@ -213,14 +214,62 @@ static inline void silence(bool silent)
     sensors.silent[0] = sensors.silent[1] = sensors.silent[2] = silent;
 }
 
+/* Raw spool that passes the flow of joint i at rate w, when its force does not change: Eq 6. */
+static inline int16_t steady_spool(enum joint i, scalar q, scalar w)
+{
+    const struct cylinder *const cylinder = &ecu.machine.cylinder[i];
+    const struct cylinder_state state = cylinder_at(cylinder, &ecu.constants.cylinder[i], q);
+    scalar p[CHAMBERS];
+    for (uint8_t c = 0; c < CHAMBERS; c++) {
+        p[c] = per_unit(sensors.pressure[i][c] * (1e5 / RAW_PER_BAR), ecu.bases.pressure);
+    }
+    const scalar QL = mul(state.lamA, mul(state.R, w)) + cylinder_leakage(cylinder, &state, p);
+    const scalar gain_QL = valve_gain(cylinder, &ecu.machine.supply, &state, p, QL >= SCALAR(0));
+    return (int16_t)lround(real(valve_spool(cylinder, quot(QL, gain_QL))) * 16384);
+}
+
+/* Raw bore pressure with which joint i carries 3 kg along this reference, Eq 1; the annulus' stays as it is. */
+static inline uint16_t carrying_pressure(enum joint i, const struct reference now[JOINTS])
+{
+    const struct arm *const arm = &ecu.machine.arm;
+    const scalar w[JOINTS] = {now[SWING].w, now[WRIST].w};
+    const scalar a[JOINTS] = {now[SWING].a, now[WRIST].a};
+    const struct wrist_trig trig = wrist_trig(arm, now[WRIST].q);
+    struct arm_row row;
+    arm_inverse_dynamics(arm, &trig, i, w, a, SCALAR(1), &row);
+    scalar theta[THETA_M];
+    for (uint8_t k = 0; k < THETA_M; k++) {
+        theta[k] = ecu.machine.estimator.m[k].value;
+    }
+    theta[M_T] = per_unit(3, base_torque(&ecu.bases));
+    const struct cylinder_constants *const cylinder = &ecu.constants.cylinder[i];
+    const struct cylinder_state state = cylinder_at(&ecu.machine.cylinder[i], cylinder, now[i].q);
+    const double force = real(arm_row_torque(&row, i, theta)) / real(state.R);
+    const double annulus_Pa = sensors.pressure[i][ANNULUS] * (1e5 / RAW_PER_BAR);
+    const double annulus = ldexp(annulus_Pa, -ecu.bases.pressure) * real(cylinder->area[ANNULUS]);
+    const double bore_Pa = ldexp((force + annulus) / real(cylinder->area[BORE]), ecu.bases.pressure);
+    return pressure_raw(bore_Pa / 1e5);
+}
+
 static inline void follow_reference(void)
 {
+    struct reference now[JOINTS];
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        now[i] = trajectory_now(&ecu.controller.trajectory[i]);
+    }
     for (uint8_t i = 0; i < JOINTS; i++) {
         if (ecu.controller.armed) {
-            sensors.angle[i] = angle_raw(real(trajectory_now(&ecu.controller.trajectory[i]).q));
+            if (!sensors.stuck_pressure[i][BORE]) {
+                sensors.pressure[i][BORE] = carrying_pressure((enum joint)i, now);
+            }
+            sensors.spool[i] = steady_spool((enum joint)i, now[i].q, now[i].w);
+            if (!sensors.stuck_angle[i]) {
+                sensors.angle[i] = angle_raw(real(now[i].q));
+            }
         }
         for (uint8_t c = 0; c < CHAMBERS; c++) {
-            sensors.pressure[i][c] ^= 1u;
+            const unsigned noise = sensors.stuck_pressure[i][c] ? 0u : ecu.counters.ticks % 2u;
+            sensors.pressure[i][c] = (uint16_t)(sensors.pressure[i][c] ^ noise);
         }
     }
 }

@@ -26,6 +26,9 @@ void setUp(void)
         const double p_Pa = bar[n / CHAMBERS][n % CHAMBERS] * 1e5;
         at.p[n / CHAMBERS][n % CHAMBERS] = per_unit(p_Pa, bases.pressure);
     }
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        machine.cylinder[i].overlap = SCALAR(0.02);
+    }
     controller.armed = true;
     controller.output[SWING].reference.w = SCALAR(0.4);
     controller.output[WRIST].reference.w = SCALAR(-0.3);
