@@ -7,7 +7,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
 C_FILES = find firmware tests/unit -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images budget demo paper test lint format generate clean
+.PHONY: help setup firmware images budget demo paper test coverage lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -48,6 +48,10 @@ test: ## every test: unit tests in C, then pytest
 	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
 	@$(PYTHON) -m pytest
+
+coverage: ## lines of the law and the ECU that the unit tests run: all of them, or it fails
+	@tools/setup.sh test
+	@$(PYTHON) tools/coverage.py
 
 rules: ## MISRA C:2012: write tests/rules/misra_findings.txt and the counts in docs/misra.md
 	@tools/setup.sh test
