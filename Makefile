@@ -8,7 +8,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet 
 C_FILES = find firmware tests/unit tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images budget demo paper test faults lint format generate clean
+.PHONY: help setup firmware images budget demo paper test faults coverage lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -54,6 +54,10 @@ faults: ## break everything on purpose: the fault matrix, build/faults.json
 	@tools/setup.sh test
 	@$(MAKE) firmware
 	@$(PYTHON) tools/faults.py
+
+coverage: ## lines of the law and the ECU that the unit tests run: all of them, or it fails
+	@tools/setup.sh test
+	@$(PYTHON) tools/coverage.py
 
 rules: ## MISRA C:2012: write tests/rules/misra_findings.txt and the counts in docs/misra.md
 	@tools/setup.sh test

@@ -249,7 +249,8 @@ def test_no_function_recurses(objects: list[Outcome]) -> None:
     """GIVEN who calls whom WHEN followed THEN nobody comes back: the stack has a bound."""
     for scalar in SCALARS:
         graph = call_graph(objects, scalar)
-        assert "controller_step" in graph["ecu_tick_end"]  # it is the whole graph
+        work = graph.get("firmware/ecu/ecu.c:work", set())  # unless the compiler has put it into its one caller
+        assert "controller_step" in graph["ecu_tick_end"] | work  # it is the whole graph
         assert any("sine" in callee for callee in graph["wrist_trig"])
         assert recursion(graph) == []
 

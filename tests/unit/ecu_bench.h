@@ -51,7 +51,7 @@ static struct {
     uint8_t status[3]; /* encoders, pressures */
     bool silent[3];
     bool follow; /* the arm is where its reference is, the spools pass what that takes, pressures are noisy */
-    double lag_s; /* it does so this much later */
+    double lag_s;                                               /* it does so this much later */
     bool stuck_angle[JOINTS], stuck_pressure[JOINTS][CHAMBERS]; /* while it follows */
 } sensors;
 

@@ -345,6 +345,7 @@ static void test_valve_kicked_by_hold_or_run(void)
             TEST_ASSERT_INT32_WITHIN(FULL_SPOOL / 100, before[SWING], spool(SWING));
             TEST_ASSERT_INT32_WITHIN(FULL_SPOOL / 100, before[WRIST], spool(WRIST));
             TEST_ASSERT_EQUAL_INT(controller, ecu.controller.kind); /* a request under way cannot change it */
+            TEST_ASSERT_EQUAL_INT(controller, ecu.requested_controller);
             if (n == 0) {
                 ticks(STOP_TICKS + 300);
             }
