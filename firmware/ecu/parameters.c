@@ -2,6 +2,9 @@
 
 #include <stddef.h>
 
+#include "ecu/crc32.h"
+#include "ecu/little_endian.h"
+
 enum parameter_kind { PARAMETER_SCALAR, PARAMETER_GAIN };
 
 struct parameter_entry {
@@ -20,23 +23,6 @@ const struct parameter_image default_parameter_image = {{
 }};
 
 #define HEADER_BYTES 12u
-
-static uint32_t read_u32(const uint8_t *bytes)
-{
-    return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
-}
-
-static uint32_t crc32(const uint8_t *bytes, uint32_t length)
-{
-    uint32_t crc = 0xFFFFFFFFu;
-    for (uint32_t k = 0; k < length; k++) {
-        crc ^= bytes[k];
-        for (uint8_t bit = 0; bit < 8u; bit++) {
-            crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
-        }
-    }
-    return ~crc;
-}
 
 /* binary32 bits as an integer that sorts as the numbers do; -0 equals 0. */
 static int32_t real32_order(uint32_t bits)
@@ -114,7 +100,7 @@ static const struct parameter_relation RELATIONS[] = {
 
 static uint32_t image_bits(const struct parameter_image *image, uint16_t entry)
 {
-    return read_u32(&image->bytes[HEADER_BYTES + 4u * entry]);
+    return get_u32(&image->bytes[HEADER_BYTES + 4u * entry]);
 }
 
 /* The entry that fills a field; every field has one. */
@@ -168,10 +154,11 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
         bytes[3] != (uint8_t)'R') {
         return ECU_IMAGE_NOT_ONE;
     }
-    if (read_u32(&bytes[4]) != PARAMETER_LAYOUT_HASH) {
+    if (get_u32(&bytes[4]) != PARAMETER_LAYOUT_HASH) {
         return ECU_IMAGE_OTHER_LAYOUT;
     }
-    if (crc32(bytes, PARAMETER_IMAGE_BYTES - 4u) != read_u32(&bytes[PARAMETER_IMAGE_BYTES - 4u])) {
+    if (crc32_add(CRC32_START, bytes, PARAMETER_IMAGE_BYTES - 4u) !=
+        get_u32(&bytes[PARAMETER_IMAGE_BYTES - 4u])) {
         return ECU_IMAGE_DAMAGED;
     }
     const struct bases found = {(int8_t)bytes[8], (int8_t)bytes[9], (int8_t)bytes[10]};

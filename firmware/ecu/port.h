@@ -1,5 +1,6 @@
-/* The whole platform, as the ECU sees it: three functions, and where there is one a memory for parameters. Linux, the in-process library and a
- * microcontroller are ports of the same ECU; nothing else of the machine reaches ecu/ or control/. */
+/* The whole platform, as the ECU sees it: three functions and, where there is one, a memory for parameters. Linux,
+ * the in-process library and a microcontroller are ports of the same ECU; nothing else of the machine reaches ecu/
+ * or control/. */
 #ifndef ECU_PORT_H
 #define ECU_PORT_H
 
