@@ -1,4 +1,4 @@
-"""Make everything that follows from the DBC, the parameter list and the reference arm.
+"""Make everything that follows from the DBC, the lists of parameters and objects, and the reference arm.
 
 Example: .venv/bin/python tools/generate.py            write the files
          .venv/bin/python tools/generate.py --check    compare them, exit 1 when one is stale
@@ -19,6 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
 from sil_plant.protocol import DBC_PATH, database, dbc_hash  # noqa: E402
+from tools.object_files import object_files  # noqa: E402
 
 NOTICE = "/* Made by tools/generate.py; do not edit. */\n"
 FRAMES_DIR = Path("can_protocol/generated")
@@ -142,7 +143,7 @@ def parameter_sources() -> dict[Path, str]:
 
 def generate() -> dict[Path, str]:
     """Every generated file, by its path in the repository."""
-    files = cantools_sources() | parameter_sources()
+    files = cantools_sources() | parameter_sources() | object_files()
     files[FRAMES_DIR / "diarc_hash.h"] = hash_header()
     files[FRAMES_DIR / "diarc_scales.h"] = scales_header()
     return files

@@ -9,7 +9,7 @@
 #define SYNC_COUNTER_LAST 240u /* CiA 301, 1019h */
 #define SENSORS_WRONG_LIMIT 5u /* ticks in a row; one more is a fault in RUN */
 #define SLOW_CYCLE_TICKS 10u   /* one slow frame in each of these phases, never two in a tick */
-#define HEARTBEAT_US 100000u
+#define HEARTBEAT_MS 100u
 #define TARE_US 100000u
 #define TARE_LIMIT_RAW 1000 /* 5 bar from tank pressure: more is no sensor's error, the pump is on */
 #define TARE_EXTRA_BITS 4   /* the mean is kept finer than a raw step */
@@ -54,8 +54,15 @@ static void restart(struct ecu *ecu)
     ecu->next_parameter = 0;
     ecu->next_page = 0;
     ecu->next_joint = 0;
+    ecu->heartbeat_ms = HEARTBEAT_MS;
     ecu->heartbeat_ticks = 0;
-    for (uint8_t k = 0; k < ECU_TX_COUNTERS; k++) {
+    ecu->heartbeat_consumer = 0;
+    ecu->master_dbc_hash = 0;
+    ecu->refused_parameter = NO_PARAMETER;
+    ecu->control_word = 0;
+    ecu->emergencies.error_register = 0; /* what they were stays to be read */
+    sdo_server_start(ecu);
+    for (uint8_t k = 0; k < TX_FRAMES; k++) {
         ecu->tx_counter[k] = 0;
     }
     ecu->complete_at_us = 0;
@@ -67,8 +74,8 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
                          uint16_t *entry)
 {
     *ecu = (struct ecu){0};
-    const enum ecu_status status =
-        parameters_load(&ecu->machine, &ecu->bases, image != NULL ? image : &default_parameter_image, entry);
+    ecu->image = image != NULL ? *image : default_parameter_image;
+    const enum ecu_status status = parameters_load(&ecu->machine, &ecu->bases, &ecu->image, entry);
     if (status != ECU_OK) {
         return status;
     }
@@ -135,12 +142,20 @@ static void refuse(struct ecu *ecu, enum ecu_refusal reason)
     ecu->counters.last_refusal = reason;
 }
 
+/* code: CiA 301 error code, 0 when the fault is gone. */
+static void send_emergency(struct ecu *ecu, const struct ecu_port *port, uint16_t code)
+{
+    const struct can_frame_11bit frame = transmit_emergency(ecu, code);
+    emergency_note(&ecu->emergencies, code, frame.data[2], (uint8_t)ecu->fault);
+    send(ecu, port, frame);
+}
+
 static void enter_fault(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault fault)
 {
     leave_run(ecu, MODE_FAULT);
     ecu->fault = fault;
     /* 8100h communication, 5000h device hardware */
-    send(ecu, port, transmit_emergency(ecu, fault == FAULT_SENSOR_FRAMES_LOST ? 0x8100u : 0x5000u));
+    send_emergency(ecu, port, fault == FAULT_SENSOR_FRAMES_LOST ? 0x8100u : 0x5000u);
 }
 
 static void nmt_command(struct ecu *ecu, const struct can_frame_11bit *frame)
@@ -171,7 +186,7 @@ static void nmt_command(struct ecu *ecu, const struct can_frame_11bit *frame)
 
 static enum ecu_refusal request_run(struct ecu *ecu, uint8_t kind)
 {
-    if (ecu->mode != MODE_STANDBY) {
+    if (ecu->mode != MODE_STANDBY || parameter_set_coming(ecu)) {
         return REFUSAL_NOT_IN_STANDBY;
     }
     if (kind >= CONTROLLERS) {
@@ -206,7 +221,7 @@ static enum ecu_refusal request_move(struct ecu *ecu, const struct diarc_motion_
 
 static enum ecu_refusal request_tare(struct ecu *ecu)
 {
-    if (ecu->mode != MODE_STANDBY || ecu->run_requested) {
+    if (ecu->mode != MODE_STANDBY || ecu->run_requested || parameter_set_coming(ecu)) {
         return REFUSAL_NOT_IN_STANDBY;
     }
     for (uint8_t n = 0; n < JOINTS * CHAMBERS; n++) {
@@ -228,8 +243,16 @@ static enum ecu_refusal request_fault_reset(struct ecu *ecu, const struct ecu_po
     }
     ecu->fault = FAULT_NONE;
     ecu->mode = MODE_STANDBY;
-    send(ecu, port, transmit_emergency(ecu, 0));
+    send_emergency(ecu, port, 0);
     return REFUSAL_NONE;
+}
+
+static void request_standby(struct ecu *ecu)
+{
+    ecu->run_requested = false;
+    if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
+        leave_run(ecu, MODE_STANDBY);
+    }
 }
 
 static void motion_request(struct ecu *ecu, const struct ecu_port *port)
@@ -248,16 +271,33 @@ static void motion_request(struct ecu *ecu, const struct ecu_port *port)
     } else if (motion.request == DIARC_MOTION_REQUEST_TARE_CHOICE) {
         refusal = request_tare(ecu);
     } else if (motion.request == DIARC_MOTION_REQUEST_STANDBY_CHOICE) {
-        ecu->run_requested = false;
-        if (ecu->mode == MODE_RUN || ecu->mode == MODE_TARE) {
-            leave_run(ecu, MODE_STANDBY);
-        }
+        request_standby(ecu);
     } else if (motion.request != DIARC_MOTION_REQUEST_NONE_CHOICE) {
         refusal = REFUSAL_UNKNOWN_REQUEST;
     }
     if (refusal != REFUSAL_NONE) {
         refuse(ecu, refusal);
     }
+}
+
+enum ecu_refusal ecu_control(struct ecu *ecu, const struct ecu_port *port, enum control_request request)
+{
+    enum ecu_refusal refusal = REFUSAL_NONE;
+    if (ecu->nmt != NMT_OPERATIONAL) {
+        refusal = REFUSAL_NOT_OPERATIONAL;
+    } else if (request == CONTROL_STANDBY) {
+        request_standby(ecu);
+    } else if (request == CONTROL_RUN) {
+        refusal = request_run(ecu, (uint8_t)CONTROLLER_DIARC);
+    } else if (request == CONTROL_RESET) {
+        refusal = request_fault_reset(ecu, port);
+    } else {
+        refusal = REFUSAL_UNKNOWN_REQUEST; /* HOLD is no mode yet */
+    }
+    if (refusal != REFUSAL_NONE) {
+        refuse(ecu, refusal);
+    }
+    return refusal;
 }
 
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
@@ -270,10 +310,17 @@ bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
             nmt_command(ecu, &frame);
             continue;
         }
+        if (frame.id == SDO_REQUEST_ID) {
+            sdo_server_receive(ecu, &frame);
+            continue;
+        }
         enum received_frame which = RX_FRAMES;
         if (receive_accept(&ecu->receive, &frame, &which) == RECEIVE_GOOD && which == RX_MOTION) {
             motion_request(ecu, port);
         }
+    }
+    if (!ecu->valves_active) {
+        sdo_server_send(ecu, port); /* no valve waits for this tick */
     }
     const bool complete = receive_complete(&ecu->receive);
     if (complete && !was_complete) {
@@ -450,6 +497,21 @@ static void arm_if_requested(struct ecu *ecu, bool good, const struct measuremen
     ecu->mode = MODE_RUN;
 }
 
+static void send_heartbeat(struct ecu *ecu, const struct ecu_port *port)
+{
+    const uint32_t cycle = ecu->heartbeat_ms * US_PER_MS / ecu->period_us;
+    if (ecu->heartbeat_ms == 0u) {
+        ecu->heartbeat_ticks = 0;
+        return;
+    }
+    if (ecu->heartbeat_ticks == 0u ||
+        ecu->heartbeat_ticks > cycle) { /* due, or the time has become shorter */
+        send(ecu, port, transmit_heartbeat((uint8_t)ecu->nmt));
+        ecu->heartbeat_ticks = cycle > 0u ? cycle : 1u;
+    }
+    ecu->heartbeat_ticks--;
+}
+
 static void send_slow_frames(struct ecu *ecu, const struct ecu_port *port)
 {
     switch (ecu->phase) {
@@ -491,7 +553,11 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
         supervise(ecu, port, good, invalid);
         tare_step(ecu, good);
         arm_if_requested(ecu, good, &measured);
-        controller_step(&ecu->controller, &ecu->machine, &ecu->constants, &measured);
+        if (parameter_set_coming(ecu)) {
+            controller_gap(&ecu->controller);
+        } else {
+            controller_step(&ecu->controller, &ecu->machine, &ecu->constants, &measured);
+        }
     }
 
     if (ecu->nmt == NMT_OPERATIONAL) {
@@ -502,11 +568,9 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
     } else {
         shut_valves(ecu, port);
     }
-    if (ecu->heartbeat_ticks == 0u) {
-        send(ecu, port, transmit_heartbeat((uint8_t)ecu->nmt));
-        ecu->heartbeat_ticks = (uint16_t)(HEARTBEAT_US / ecu->period_us);
-    }
-    ecu->heartbeat_ticks--;
+    send_heartbeat(ecu, port);
+    sdo_server_send(ecu, port);
+    sdo_server_tick(ecu);
     ecu->phase = (uint8_t)((ecu->phase + 1u) % SLOW_CYCLE_TICKS);
     ecu->counters.ticks++;
 }

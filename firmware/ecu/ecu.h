@@ -9,9 +9,13 @@
 #ifndef ECU_ECU_H
 #define ECU_ECU_H
 
+#include "ecu/control_word.h"
+#include "ecu/emergency.h"
+#include "ecu/parameter_set.h"
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
+#include "ecu/sdo_server.h"
 
 #define ECU_NODE_ID 1u
 #define ECU_PERIOD_LOW_US 250u
@@ -69,11 +73,15 @@ struct ecu_counters {
     uint16_t tick_time_us; /* last sensor frame to valve frame, of the last tick; stops at 65535 */
 };
 
-#define ECU_TX_COUNTERS 5
+/* Frames with E2E protection, by who counts them. */
+enum sent_frame { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING, TX_FRAMES };
 
 /* All of the ECU; a port owns one and looks into it only to report. */
 struct ecu {
-    struct machine machine;
+    struct parameter_image
+        image; /* the set in force, from which all of machine, bases and constants follow */
+    struct parameter_set_coming coming;
+    struct machine machine; /* not there while a set is coming: parameter_set.h */
     struct bases bases;
     struct controller_constants constants;
     struct controller controller;
@@ -94,9 +102,17 @@ struct ecu {
     uint8_t sync_counter; /* 1..240 */
     uint8_t phase;        /* tick modulo the slow frames' cycle */
     uint8_t next_parameter, next_page, next_joint;
-    uint16_t heartbeat_ticks; /* to the next heartbeat */
-    uint8_t tx_counter[ECU_TX_COUNTERS];
-    uint32_t complete_at_us; /* when the last sensor frame of this tick came */
+    uint16_t heartbeat_ms;       /* 1017h; 0: none is sent */
+    uint32_t heartbeat_ticks;    /* to the next heartbeat */
+    uint32_t heartbeat_consumer; /* 1016h:1, node << 16 | ms */
+    uint32_t master_dbc_hash;    /* 2002h; 0: not told */
+    uint16_t refused_parameter;  /* 200Eh */
+    uint16_t control_word;       /* 6040h, as written last */
+    struct emergency_history emergencies;
+    struct sdo_server sdo;
+    uint8_t tx_counter[TX_FRAMES];
+    uint8_t sent[TX_FRAMES][8]; /* data of the last frame of each */
+    uint32_t complete_at_us;    /* when the last sensor frame of this tick came */
     struct ecu_counters counters;
 };
 
@@ -108,6 +124,9 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
 void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port);
+
+/* A request of the control word; the refusal is counted. */
+enum ecu_refusal ecu_control(struct ecu *ecu, const struct ecu_port *port, enum control_request request);
 
 /* Valves to zero and disabled, once, now: for a port that is about to stop. */
 void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port);
