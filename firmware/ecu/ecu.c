@@ -55,7 +55,8 @@ static void restart(struct ecu *ecu)
     ecu->next_page = 0;
     ecu->next_joint = 0;
     ecu->heartbeat_ms = HEARTBEAT_MS;
-    ecu->heartbeat_ticks = 0;
+    /* not right behind boot-up: clients that wait for that look at the last one that came */
+    ecu->heartbeat_ticks = HEARTBEAT_MS * US_PER_MS / ecu->period_us;
     ecu->heartbeat_consumer = 0;
     ecu->master_dbc_hash = 0;
     ecu->refused_parameter = NO_PARAMETER;
