@@ -275,7 +275,8 @@ static enum object_abort read_call(const struct ecu *ecu, const struct ecu_port 
         break;
     case CALL_IMAGE:
     default:
-        return ABORT_NO_OBJECT; /* no number */
+        *value = 0; /* no number: nobody asks */
+        break;
     }
     return OBJECT_DONE;
 }
@@ -295,7 +296,8 @@ static enum object_abort read_row(const struct ecu *ecu, const struct ecu_port *
         return read_call(ecu, port, object, value);
     case SOURCE_TEXT:
     default:
-        return ABORT_NO_OBJECT; /* no number */
+        *value = 0; /* no number: nobody asks */
+        return OBJECT_DONE;
     }
 }
 

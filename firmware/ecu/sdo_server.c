@@ -97,8 +97,8 @@ static void upload(struct ecu *ecu, const struct ecu_port *port)
     if (length < EXPEDITED_BYTES) {
         value &= ((uint32_t)1 << (8u * length)) - 1u;
     }
-    const uint8_t unused = (uint8_t)(EXPEDITED_BYTES - length);
-    answer(sdo, (uint8_t)(ANSWER_UPLOAD | (unused << 2) | BIT_EXPEDITED | BIT_SIZE), value);
+    const uint32_t unused = EXPEDITED_BYTES - length;
+    answer(sdo, (uint8_t)(ANSWER_UPLOAD | unused << 2 | BIT_EXPEDITED | BIT_SIZE), value);
 }
 
 static void upload_segment(struct ecu *ecu)
