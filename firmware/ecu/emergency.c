@@ -1,9 +1,7 @@
 #include "ecu/emergency.h"
 
-void emergency_note(struct emergency_history *history, uint16_t error_code, uint8_t error_register,
-                    uint8_t fault_code)
+void emergency_note(struct emergency_history *history, uint16_t error_code, uint8_t fault_code)
 {
-    history->error_register = error_register;
     if (error_code == 0u) {
         return;
     }

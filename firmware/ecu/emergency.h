@@ -1,4 +1,4 @@
-/* What the last emergencies said: objects 1001h and 1003h. */
+/* What the last emergencies said: object 1003h. */
 #ifndef ECU_EMERGENCY_H
 #define ECU_EMERGENCY_H
 
@@ -9,11 +9,9 @@
 struct emergency_history {
     uint32_t entry[EMERGENCIES_KEPT]; /* newest first: error code, fault code << 16 */
     uint8_t count;
-    uint8_t error_register; /* as the last one said; 0 when the fault is gone */
 };
 
 /* An emergency has been sent. error_code 0 says that the fault is gone, and is no error to keep. */
-void emergency_note(struct emergency_history *history, uint16_t error_code, uint8_t error_register,
-                    uint8_t fault_code);
+void emergency_note(struct emergency_history *history, uint16_t error_code, uint8_t fault_code);
 
 #endif

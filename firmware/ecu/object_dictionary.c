@@ -3,7 +3,6 @@
 #include <stddef.h>
 
 #include "can_protocol/generated/diarc_hash.h"
-#include "ecu/control_word.h"
 #include "ecu/ecu.h"
 #include "ecu/store.h"
 
@@ -225,22 +224,6 @@ static uint32_t field(const struct ecu *ecu, const struct object_row *row)
     return value;
 }
 
-static uint16_t status_word(const struct ecu *ecu)
-{
-    const uint16_t ready = ecu->fault == FAULT_NONE ? STATUS_WORD_READY : 0u;
-    switch (ecu->mode) {
-    case MODE_STANDBY:
-    case MODE_TARE:
-        return ready | CONTROL_WORD_D;
-    case MODE_RUN:
-        return ready | CONTROL_WORD_D | CONTROL_WORD_H | CONTROL_WORD_M;
-    case MODE_INIT:
-    case MODE_FAULT:
-    default:
-        return ready;
-    }
-}
-
 static enum object_abort read_call(const struct ecu *ecu, const struct ecu_port *port,
                                    const struct object *object, uint32_t *value)
 {
@@ -258,8 +241,8 @@ static enum object_abort read_call(const struct ecu *ecu, const struct ecu_port 
     case CALL_RESTORE:
         *value = port->store != NULL ? SAVES_ON_COMMAND : 0u;
         break;
-    case CALL_ACTIVE_FAULTS:
-        *value = ecu->fault == FAULT_NONE ? 0u : (uint32_t)1 << ecu->fault;
+    case CALL_ERROR_REGISTER:
+        *value = fault_error_register(ecu);
         break;
     case CALL_LOAD:
         *value = estimate(ecu, M_T);
@@ -271,7 +254,7 @@ static enum object_abort read_call(const struct ecu *ecu, const struct ecu_port 
         *value = ecu->control_word;
         break;
     case CALL_STATUS_WORD:
-        *value = status_word(ecu);
+        *value = mode_cia408_status(ecu->mode);
         break;
     case CALL_IMAGE:
     default:
@@ -381,7 +364,7 @@ uint8_t object_byte(const struct ecu *ecu, const struct object *object, uint32_t
 static bool is_idle(const struct ecu *ecu)
 {
     return (ecu->mode == MODE_INIT || ecu->mode == MODE_STANDBY || ecu->mode == MODE_FAULT) &&
-           !ecu->run_requested;
+           !ecu->is_pending;
 }
 
 enum object_abort object_may_write(const struct ecu *ecu, const struct object *object)
@@ -428,15 +411,12 @@ static enum object_abort keep(const struct ecu *ecu, const struct ecu_port *port
 
 static enum object_abort write_control_word(struct ecu *ecu, const struct ecu_port *port, uint16_t word)
 {
-    const enum control_request request = control_word_request(word);
-    if (request == CONTROL_UNKNOWN) {
-        return ABORT_RANGE;
+    const enum ecu_refusal refusal = request_control_word(ecu, port, word);
+    request_refused(ecu, refusal);
+    if (refusal == REFUSAL_NONE) {
+        return OBJECT_DONE;
     }
-    if (ecu_control(ecu, port, request) != REFUSAL_NONE) {
-        return ABORT_STATE;
-    }
-    ecu->control_word = word;
-    return OBJECT_DONE;
+    return refusal == REFUSAL_UNKNOWN_REQUEST ? ABORT_RANGE : ABORT_STATE;
 }
 
 static enum object_abort write_call(struct ecu *ecu, const struct ecu_port *port, enum object_call call,
@@ -453,7 +433,7 @@ static enum object_abort write_call(struct ecu *ecu, const struct ecu_port *port
         return write_control_word(ecu, port, (uint16_t)value);
     case CALL_ERROR_ENTRY:
     case CALL_IMAGE:
-    case CALL_ACTIVE_FAULTS:
+    case CALL_ERROR_REGISTER:
     case CALL_LOAD:
     case CALL_LOAD_SD:
     case CALL_STATUS_WORD:

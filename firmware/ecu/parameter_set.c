@@ -17,7 +17,10 @@ static void start_anew(struct ecu *ecu)
     uint16_t entry = 0;
     (void)parameters_load(&ecu->machine, &ecu->bases, &ecu->image, &entry);
     ecu->constants = controller_constants(&ecu->machine, ecu->constants.dt_s);
+    const bool held = ecu->controller.estimator.held; /* follows from the active faults, not from the set */
     controller_start(&ecu->controller, &ecu->machine, &ecu->constants);
+    ecu->controller.estimator.held = held;
+    supervision_start(ecu);
     if (ecu->bases.pressure != before.pressure) {
         ecu->tare = (struct tare){0}; /* its offsets were per unit of another base */
     }

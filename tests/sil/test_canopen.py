@@ -36,7 +36,7 @@ AT_REST = {
     "PRESSURES_SWING": {"BorePressure": 10000, "AnnulusPressure": 14628},
     "PRESSURES_WRIST": {"BorePressure": 8412, "AnnulusPressure": 10000},
 }
-INIT, STANDBY, RUN = 0, 1, 2
+INIT, STANDBY, RUN, FAULT = 0, 1, 2, 15
 SEGMENTS = 78  # of an image
 # What the client needs but for PDOs: a slow machine loses frames in its socket when it must look at all of them.
 SERVICES = [{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x081, 0x581, 0x701)]
@@ -371,9 +371,16 @@ def test_fault_is_not_kept_from_the_client(bench: Bench) -> None:
     assert node.sdo["Pre-defined error field"][0].raw == 1
     assert node.sdo["Pre-defined error field"][1].raw == emergency.code | fault << 16
     assert node.sdo["Active faults"].raw == 1 << fault
-    assert "present device state" in str(bench.set("Control word", 0x8))  # no sensors yet
     bench.io.silent.clear()
-    bench.until(lambda: bench.set("Control word", 0x8) is None, "reset of the fault")
+    bench.until_mode(FAULT)
+    assert "present device state" in str(bench.set("Control word", 0x7))
+
+    def reset() -> bool:
+        node.sdo["Control word"].raw = 0x0  # bit R must rise
+        return bench.set("Control word", 0x8) is None
+
+    bench.until(reset, "reset of the fault")
+    bench.until_mode(STANDBY)
     bench.until(lambda: not node.emcy.active, "EMCY of no error")
     assert node.sdo["Error register"].raw == 0
     node.sdo["Pre-defined error field"][0].raw = 0

@@ -180,13 +180,22 @@ static inline void to_run(void)
     TEST_ASSERT_EQUAL_INT(MODE_RUN, ecu.mode);
 }
 
+/* No sensors until the safe stop has ended in FAULT; then they are back. */
+static inline void fall_silent(void)
+{
+    wire.silenced = true;
+    for (int k = 0; k < 1000 && ecu.mode != MODE_FAULT; k++) {
+        tick();
+    }
+    wire.silenced = false;
+    tick();
+    TEST_ASSERT_EQUAL_INT(MODE_FAULT, ecu.mode);
+}
+
 static inline void to_fault(void)
 {
     to_run();
-    wire.silenced = true;
-    ticks(6);
-    wire.silenced = false;
-    TEST_ASSERT_EQUAL_INT(MODE_FAULT, ecu.mode);
+    fall_silent();
 }
 
 /* ---- the client ---- */

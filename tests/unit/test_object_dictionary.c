@@ -102,7 +102,7 @@ static void test_communication_object_of_another_value(void)
         {0x1011, 1, 4, 1},
         {0x1014, 0, 4, 0x81},
         {0x1016, 0, 1, 1},
-        {0x1016, 1, 4, 0},
+        {0x1016, 1, 4, 0x000201F4},
         {0x1017, 0, 2, 100},
         {0x1018, 0, 1, 4},
         {0x1018, 1, 4, 0},
@@ -122,9 +122,7 @@ static void test_communication_object_of_another_value(void)
         {0x1800, 2, 1, 10},
         {0x1804, 1, 4, 0x40000202},
         {0x1804, 2, 1, 1},
-        {0x1A00, 0, 1, 10},
         {0x1A00, 4, 4, 0x30040418},
-        {0x3004, 0, 1, 10},
     };
     for (unsigned k = 0; k < COUNT_OF(cases); k++) {
         char name[16];
@@ -158,9 +156,10 @@ static void test_state_object_of_another_value(void)
     TEST_ASSERT_EQUAL_UINT32(MODE_FAULT, number(0x2004, 0));
     TEST_ASSERT_EQUAL_UINT32(FAULT_SENSOR_FRAMES_LOST, number(0x2005, 0));
     TEST_ASSERT_EQUAL_UINT32(1u << FAULT_SENSOR_FRAMES_LOST, number(0x2007, 0));
-    TEST_ASSERT_EQUAL_UINT32(0x81, number(0x1001, 0));
-    TEST_ASSERT_EQUAL_UINT32(6, number(0x200A, 0));
-    TEST_ASSERT_EQUAL_UINT32(18, number(0x200B, 0));
+    TEST_ASSERT_EQUAL_UINT32(0x11, number(0x1001, 0)); /* generic, communication */
+    TEST_ASSERT_TRUE(ecu.counters.late_ticks > 5u);
+    TEST_ASSERT_EQUAL_UINT32(ecu.counters.late_ticks, number(0x200A, 0));
+    TEST_ASSERT_EQUAL_UINT32(3u * ecu.counters.late_ticks, number(0x200B, 0));
     TEST_ASSERT_EQUAL_UINT32(1000, number(0x2008, 0));
     ecu.counters.send_drops = 0x1234;
     ecu.receive.refused = 7;
@@ -266,8 +265,8 @@ static void test_parameter_outside_its_limits_taken(void)
         const uint16_t index = (uint16_t)(FIRST_PARAMETER + k);
         TEST_ASSERT_EQUAL_HEX32(image_u32(&default_parameter_image, IMAGE_HEADER_BYTES + 4u * k),
                                 number(index, 0));
-        TEST_ASSERT_EQUAL_HEX32(ABORT_TOO_LOW, write_number(index, 0, bits_of(-1.1e6), 4));
-        TEST_ASSERT_EQUAL_HEX32(ABORT_TOO_HIGH, write_number(index, 0, bits_of(3.3e7), 4));
+        TEST_ASSERT_EQUAL_HEX32(ABORT_TOO_LOW, write_number(index, 0, bits_of(-3e38), 4));
+        TEST_ASSERT_EQUAL_HEX32(ABORT_TOO_HIGH, write_number(index, 0, bits_of(3e38), 4));
         TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, write_number(index, 0, 0x7FC00000u, 4));
         TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, write_number(index, 0, 0x7F800000u, 4));
         TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, write_number(index, 0, 0xFF800000u, 4));
@@ -375,13 +374,24 @@ static void test_machine_changed_under_a_moving_arm(void)
         TEST_ASSERT_EQUAL_HEX32(expected, write_number(0x1010, 1, 0x65766173, 4));
         TEST_ASSERT_EQUAL_HEX32(expected, write_number(0x1011, 1, 0x64616F6C, 4));
         TEST_ASSERT_EQUAL_HEX32(0, write_number(0x1017, 0, 50, 2));
-        TEST_ASSERT_EQUAL_HEX32(0, write_number(0x2002, 0, 0x12345678, 4));
-        TEST_ASSERT_EQUAL_HEX32(0x12345678, number(0x2002, 0));
+        TEST_ASSERT_EQUAL_HEX32(0, write_number(0x2002, 0, DIARC_DBC_HASH, 4));
+        TEST_ASSERT_EQUAL_HEX32(DIARC_DBC_HASH, number(0x2002, 0));
         TEST_ASSERT_EQUAL_INT(cases[k].mode, ecu.mode);
         if (!cases[k].allowed) {
             TEST_ASSERT_EQUAL_MEMORY(&default_parameter_image, &ecu.image, sizeof ecu.image);
         }
     }
+}
+
+static void test_master_of_another_dbc_not_told(void)
+{
+    /* GIVEN a master that writes the hash of its DBC WHEN it is another THEN the ECU is in FAULT and says so */
+    to_standby();
+    TEST_ASSERT_EQUAL_HEX32(0, write_number(0x2002, 0, DIARC_DBC_HASH ^ 1u, 4));
+    tick();
+    TEST_ASSERT_EQUAL_UINT32(MODE_FAULT, number(0x2004, 0));
+    TEST_ASSERT_EQUAL_UINT32(FAULT_DBC_MISMATCH, number(0x2005, 0));
+    TEST_ASSERT_EQUAL_UINT32(FAULT_DBC_MISMATCH, number(0x1003, 1) >> 16);
 }
 
 static void test_parameter_written_between_request_and_run(void)
@@ -439,10 +449,7 @@ static void test_error_history_in_another_order(void)
     for (int k = 0; k < 10; k++) {
         queue_request(2, CONTROLLER_DIARC);
         tick();
-        wire.silenced = true;
-        ticks(6);
-        wire.silenced = false;
-        TEST_ASSERT_EQUAL_INT(MODE_FAULT, ecu.mode);
+        fall_silent();
         if (k == 9) {
             break;
         }
@@ -452,13 +459,13 @@ static void test_error_history_in_another_order(void)
         TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
         TEST_ASSERT_EQUAL_UINT32(0, number(0x1001, 0));
     }
-    emergency_note(&ecu.emergencies, 0x5000, 0x81, FAULT_SENSOR_INVALID);
+    emergency_note(&ecu.emergencies, 0x5000, FAULT_SENSOR_INVALID);
     TEST_ASSERT_EQUAL_UINT32(8, number(0x1003, 0));
     TEST_ASSERT_EQUAL_HEX32(0x00025000, number(0x1003, 1));
     for (uint8_t k = 2; k <= 8; k++) {
         TEST_ASSERT_EQUAL_HEX32(0x00018100, number(0x1003, k));
     }
-    TEST_ASSERT_EQUAL_UINT32(0x81, number(0x1001, 0));
+    TEST_ASSERT_EQUAL_UINT32(0x11, number(0x1001, 0));
     TEST_ASSERT_EQUAL_HEX32(ABORT_NO_SUB_INDEX, read_object(0x1003, 9));
     TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, write_number(0x1003, 0, 1, 1));
     TEST_ASSERT_EQUAL_UINT32(8, number(0x1003, 0));
@@ -513,26 +520,33 @@ static void test_control_word_not_followed(void)
      * with the reason in 2006h; the status word mirrors the mode; a word that is none is out of range */
     TEST_ASSERT_EQUAL_HEX16(0x8, number(0x6041, 0));
     TEST_ASSERT_EQUAL_HEX32(ABORT_STATE, write_number(0x6040, 0, 0x7, 2));
-    TEST_ASSERT_EQUAL_UINT32(REFUSAL_NOT_OPERATIONAL, number(0x2006, 0));
+    TEST_ASSERT_EQUAL_UINT32(REFUSAL_NOT_IN_STANDBY, number(0x2006, 0));
     to_standby();
     TEST_ASSERT_EQUAL_HEX16(0x9, number(0x6041, 0));
-    TEST_ASSERT_EQUAL_HEX32(ABORT_STATE, write_number(0x6040, 0, 0x8, 2));
-    TEST_ASSERT_EQUAL_UINT32(REFUSAL_NO_FAULT_TO_RESET, number(0x2006, 0));
     TEST_ASSERT_EQUAL_HEX32(0, write_number(0x6040, 0, 0x7, 2));
     TEST_ASSERT_EQUAL_INT(MODE_RUN, ecu.mode);
     TEST_ASSERT_EQUAL_INT(CONTROLLER_DIARC, ecu.controller.kind);
     TEST_ASSERT_EQUAL_HEX16(0xF, number(0x6041, 0));
     TEST_ASSERT_EQUAL_HEX16(0x7, number(0x6040, 0));
-    static const uint16_t none[] = {0x2, 0x4, 0x5, 0x6, 0x10, 0x8000};
+    static const uint16_t none[] = {0x2, 0x4, 0x5, 0x6, 0x10, 0x8000, 0xFFFF};
     for (unsigned k = 0; k < COUNT_OF(none); k++) {
         TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, write_number(0x6040, 0, none[k], 2));
     }
     TEST_ASSERT_EQUAL_INT(MODE_RUN, ecu.mode);
+    TEST_ASSERT_EQUAL_HEX32(0, write_number(0x6040, 0, 0x3, 2));
+    tick(); /* the answer goes out after the law's work of its tick */
+    TEST_ASSERT_EQUAL_INT(MODE_HOLD, ecu.mode);
+    TEST_ASSERT_EQUAL_HEX16(0xB, number(0x6041, 0));
     TEST_ASSERT_EQUAL_HEX32(0, write_number(0x6040, 0, 0x1, 2));
+    TEST_ASSERT_EQUAL_INT(MODE_SAFE_STOP, ecu.mode);
+    TEST_ASSERT_EQUAL_HEX32(ABORT_STATE, write_number(0x6040, 0, 0x7, 2));
+    TEST_ASSERT_EQUAL_UINT32(REFUSAL_STOPPING, number(0x2006, 0));
+    ticks(300);
     TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
     power_on();
     to_fault();
-    TEST_ASSERT_EQUAL_HEX16(0x0, number(0x6041, 0));
+    TEST_ASSERT_EQUAL_HEX16(0x1, number(0x6041, 0));
+    TEST_ASSERT_EQUAL_HEX32(ABORT_STATE, write_number(0x6040, 0, 0x7, 2));
     TEST_ASSERT_EQUAL_HEX32(0, write_number(0x6040, 0, 0x8, 2));
     TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
 }
@@ -553,6 +567,7 @@ int main(void)
     RUN_TEST(test_parameter_written_by_half);
     RUN_TEST(test_tare_of_another_base_kept);
     RUN_TEST(test_machine_changed_under_a_moving_arm);
+    RUN_TEST(test_master_of_another_dbc_not_told);
     RUN_TEST(test_parameter_written_between_request_and_run);
     RUN_TEST(test_saved_set_is_not_the_one_in_force);
     RUN_TEST(test_save_that_failed_reported_done);

@@ -5,7 +5,7 @@
 #define OBJECT_ROWS 52
 #define OBJECT_TEXTS 3
 #define OBJECT_PDOS 9
-#define OBJECT_SIGNALS 63
+#define OBJECT_SIGNALS 64
 #define FIRST_ESTIMATE 0x2020u
 #define FIRST_ESTIMATE_SD 0x2040u
 #define FIRST_PARAMETER 0x2100u
@@ -29,12 +29,12 @@ enum object_type {
 };
 
 enum object_call {
+    CALL_ERROR_REGISTER,
     CALL_ERROR_COUNT,
     CALL_ERROR_ENTRY,
     CALL_STORE,
     CALL_RESTORE,
     CALL_IMAGE,
-    CALL_ACTIVE_FAULTS,
     CALL_LOAD,
     CALL_LOAD_SD,
     CALL_CONTROL_WORD,
