@@ -51,6 +51,7 @@ static struct {
     uint8_t status[3]; /* encoders, pressures */
     bool silent[3];
     bool follow; /* the arm is where its reference is, the spools pass what that takes, pressures are noisy */
+    double lag_s; /* it does so this much later */
     bool stuck_angle[JOINTS], stuck_pressure[JOINTS][CHAMBERS]; /* while it follows */
 } sensors;
 
@@ -255,7 +256,10 @@ static inline void follow_reference(void)
 {
     struct reference now[JOINTS];
     for (uint8_t i = 0; i < JOINTS; i++) {
-        now[i] = trajectory_now(&ecu.controller.trajectory[i]);
+        const struct reference exact = trajectory_now(&ecu.controller.trajectory[i]);
+        now[i] = exact;
+        now[i].q = from_real(real(exact.q) - sensors.lag_s * real(exact.w));
+        now[i].w = from_real(real(exact.w) - sensors.lag_s * real(exact.a));
     }
     for (uint8_t i = 0; i < JOINTS; i++) {
         if (ecu.controller.armed) {

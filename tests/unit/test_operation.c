@@ -360,7 +360,7 @@ static void test_move_not_carried_out_as_asked(void)
         setUp();
         to_run(CONTROLLER_PID);
         sensors.follow = true;
-        queue_request(REQUEST_MOVE, i, 0, 0.35, 200);
+        queue_request(REQUEST_MOVE, i, 0, 0.15, 200);
         ticks(100);
         TEST_ASSERT_TRUE(trajectory_moving(&ecu.controller.trajectory[i]));
         TEST_ASSERT_FALSE(trajectory_moving(&ecu.controller.trajectory[1 - i]));
@@ -373,7 +373,7 @@ static void test_move_not_carried_out_as_asked(void)
         }
         TEST_ASSERT_FALSE(trajectory_moving(&ecu.controller.trajectory[i]));
         TEST_ASSERT_EQUAL_UINT32(0, get_bits(wait_for(0x181, 0, 8, -1), 60, 1));
-        TEST_ASSERT_INT32_WITHIN(1, angle_raw(0.35), get_signed(wait_for(0x281, 16, 4, i), 40, 24));
+        TEST_ASSERT_INT32_WITHIN(1, angle_raw(0.15), get_signed(wait_for(0x281, 16, 4, i), 40, 24));
         TEST_ASSERT_INT32_WITHIN(1, angle_raw(0.1), get_signed(wait_for(0x281, 16, 4, 1 - i), 40, 24));
     }
 }
