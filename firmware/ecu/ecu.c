@@ -36,9 +36,10 @@ static void count_u16(uint16_t *counter)
 /* Back to the state of power-on; parameters stay. Field by field: a copy of the whole would need its size in stack. */
 static void restart(struct ecu *ecu)
 {
-    ecu->mode = MODE_INIT;
+    const bool sound = ecu->stored == STORE_OK || ecu->stored == STORE_EMPTY;
+    ecu->mode = sound ? MODE_INIT : MODE_FAULT;
     ecu->nmt = NMT_PRE_OPERATIONAL;
-    ecu->fault = FAULT_NONE;
+    ecu->fault = sound ? FAULT_NONE : FAULT_STORE_DAMAGED;
     ecu->receive = (struct receive){0};
     ecu->samples = (struct sensor_samples){0};
     ecu->tare = (struct tare){0};
@@ -83,6 +84,28 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
     return ECU_OK;
 }
 
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry)
+{
+    enum store_status stored = store != NULL ? store_load(store, buffer) : STORE_EMPTY;
+    if (stored == STORE_OK || stored == STORE_OLDER) {
+        const enum ecu_status status = ecu_init(ecu, buffer, period_us, entry);
+        if (status == ECU_OK) {
+            ecu->stored = stored;
+            restart(ecu);
+            return ECU_OK;
+        }
+        stored = STORE_FOREIGN;
+    }
+    const enum ecu_status status = ecu_init(ecu, fallback, period_us, entry);
+    if (status == ECU_OK) {
+        ecu->stored = stored;
+        restart(ecu);
+    }
+    return status;
+}
+
 static void send(struct ecu *ecu, const struct ecu_port *port, struct can_frame_11bit frame)
 {
     if (port->send(port->context, &frame) != PORT_OK) {
@@ -123,6 +146,9 @@ void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
     if (ecu->boot_up_due) {
         send(ecu, port, transmit_heartbeat(0));
         ecu->boot_up_due = false;
+        if (ecu->fault == FAULT_STORE_DAMAGED) {
+            send(ecu, port, transmit_emergency(ecu, 0x6300u)); /* data set */
+        }
     }
     ecu->sync_counter = (uint8_t)(ecu->sync_counter % SYNC_COUNTER_LAST + 1u);
     receive_begin_tick(&ecu->receive, ecu->sync_counter);
@@ -225,6 +251,9 @@ static enum ecu_refusal request_fault_reset(struct ecu *ecu, const struct ecu_po
     }
     if (ecu->sensors_wrong > 0u) {
         return REFUSAL_SENSORS_NOT_FRESH;
+    }
+    if (ecu->fault == FAULT_STORE_DAMAGED) {
+        ecu->stored = STORE_OK; /* confirmed: a restart does not ask again */
     }
     ecu->fault = FAULT_NONE;
     ecu->mode = MODE_STANDBY;

@@ -12,6 +12,7 @@
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
+#include "ecu/store.h"
 
 #define ECU_NODE_ID 1u
 #define ECU_PERIOD_LOW_US 250u
@@ -28,7 +29,12 @@ enum ecu_mode {
 
 enum nmt_state { NMT_STOPPED = 4, NMT_OPERATIONAL = 5, NMT_PRE_OPERATIONAL = 127 };
 
-enum ecu_fault { FAULT_NONE = 0, FAULT_SENSOR_FRAMES_LOST = 1, FAULT_SENSOR_INVALID = 2 };
+enum ecu_fault {
+    FAULT_NONE = 0,
+    FAULT_SENSOR_FRAMES_LOST = 1,
+    FAULT_SENSOR_INVALID = 2,
+    FAULT_STORE_DAMAGED = 17 /* from power-on until RESET_FAULT says that what is in use is wanted */
+};
 
 /* Why a request was not carried out; LastRefusal on the timing frame. */
 enum ecu_refusal {
@@ -78,6 +84,7 @@ struct ecu {
     struct controller_constants constants;
     struct controller controller;
     uint32_t period_us;
+    enum store_status stored; /* STORE_OK again once its fault is reset */
     enum ecu_mode mode;
     enum nmt_state nmt;
     enum ecu_fault fault;
@@ -104,6 +111,13 @@ struct ecu {
  * not usable, and with ECU_PARAMETER_RANGE *entry is the parameter's number (parameter_name). */
 enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, uint32_t period_us,
                          uint16_t *entry);
+
+/* The same from what is stored. `fallback` (NULL: the reference arm) is used when nothing is, and also when what is
+ * stored is damaged or this firmware refuses it; the latter, or an older set than the last one saved, is fault
+ * STORE_DAMAGED. `store` NULL: nothing survives. *buffer is overwritten. */
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry);
 
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
