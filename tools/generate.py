@@ -17,6 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from sil_plant.config import tomllib  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
 from sil_plant.protocol import DBC_PATH, database, dbc_hash  # noqa: E402
 
@@ -140,9 +141,104 @@ def parameter_sources() -> dict[Path, str]:
     }
 
 
+FAULTS = ROOT / "can_protocol" / "faults.toml"
+ERROR_REGISTER_BITS = {"communication": 0x10, "device": 0x20, "manufacturer": 0x80}
+REACTIONS = {
+    "degrade": "degrade: the estimate is held, the arm keeps moving",
+    "safe_stop": "safe stop: the set-points ramp down on the model, then FAULT",
+    "valves_off": "valves off: FAULT at once",
+}
+
+
+def fault_sources() -> dict[Path, str]:
+    """The faults' codes and table for the ECU, and the page for people."""
+    faults = tomllib.loads(FAULTS.read_text(encoding="utf-8"))["fault"]
+    if [fault["code"] for fault in faults] != list(range(1, len(faults) + 1)):
+        raise SystemExit("faults.toml: codes must count from 1 without gaps")
+    codes = "".join(f"    FAULT_{fault['name']} = {fault['code']},\n" for fault in faults)
+    header = (
+        NOTICE
+        + "#ifndef FAULT_CODES_H\n#define FAULT_CODES_H\n\n"
+        + f"enum ecu_fault {{\n    FAULT_NONE = 0,\n{codes}    FAULTS\n}};\n\n#endif\n"
+    )
+    rows = "".join(
+        f"    [FAULT_{fault['name']}] = {{0x{fault['emcy']:04X}u, 0x{ERROR_REGISTER_BITS[fault['register']]:02X}u, "
+        f"(uint8_t)REACTION_{fault['reaction'].upper()}}},\n"
+        for fault in faults
+    )
+    page = [
+        "# Faults",
+        "",
+        "Made from `can_protocol/faults.toml` by `tools/generate.py`; do not edit.",
+        "",
+        "A fault that becomes active is told by an EMCY frame (0x081) with its code, by `FaultCode` on TIMING and by",
+        "its bit in object 2007h. After a safe stop or valves off the ECU stays in FAULT until the request",
+        "RESET_FAULT, which is refused while the cause is still there (`CAUSE_PERSISTS`, `SENSORS_NOT_FRESH`). The",
+        "limits are parameters of the machine file, section `supervision`.",
+        "",
+        "| code | name | EMCY | reaction | limit |",
+        "|---|---|---|---|---|",
+    ]
+    for fault in faults:
+        limit = fault["limit"] or "-"
+        reaction = fault["reaction"].replace("_", " ")
+        page.append(
+            f"| {fault['code']} | [{fault['name']}](#{fault['name'].lower()}) | {fault['emcy']:04X}h | {reaction} "
+            f"| {limit} |"
+        )
+    for fault in faults:
+        page += [
+            "",
+            f"## {fault['name']}",
+            "",
+            f'Code {fault["code"]}, EMCY {fault["emcy"]:04X}h, error register bit "{fault["register"]}".',
+            "",
+            f"- When: {fault['when']}.",
+            f"- Limit: {fault['limit'] or 'none'}.",
+            f"- Reaction: {REACTIONS[fault['reaction']]}.",
+            f"- To clear: {fault['clear']}.",
+        ]
+    return {
+        ECU_DIR / "fault_codes.h": header,
+        ECU_DIR / "fault_table.inc": NOTICE + rows,
+        Path("docs/faults.md"): "\n".join(page) + "\n",
+    }
+
+
+MODES_SOURCE = ROOT / "firmware" / "ecu" / "modes.c"
+CONDITIONS = {
+    "ALWAYS": "",
+    "IF_OPERATIONAL": "NMT operational",
+    "IF_READY": "NMT operational, all sensors good",
+    "IF_FAULT_ACTIVE": "a fault that stops is active",
+    "IF_CAUSE_GONE": "sensors good, the cause of the fault gone",
+}
+
+
+def mode_page() -> dict[Path, str]:
+    """The table of the modes as the ECU has it, for people."""
+    pattern = r"\{MODE_(\w+), EVENT_(\w+), (\w+), MODE_(\w+)\},"
+    rows = re.findall(pattern, MODES_SOURCE.read_text(encoding="utf-8"))
+    page = [
+        "# Modes",
+        "",
+        "Made from the table of `firmware/ecu/modes.c` by `tools/generate.py`; do not edit.",
+        "",
+        "STANDBY, RUN, TARE, COMMISSION, HOLD, SAFE_STOP and RESET_FAULT are requests (MOTION, 0x201; object 6040h",
+        "for those of CiA 408); the other events are the ECU's own. A request without a row is refused, and",
+        "`LastRefusal` on TIMING says why. The valves are driven in RUN, COMMISSION, HOLD and SAFE_STOP only; in all",
+        "other modes the set-points are zero and disabled.",
+        "",
+        "| mode | event | if | to |",
+        "|---|---|---|---|",
+    ]
+    page += [f"| {start} | {event} | {CONDITIONS[condition]} | {end} |" for start, event, condition, end in rows]
+    return {Path("docs/modes.md"): "\n".join(page) + "\n"}
+
+
 def generate() -> dict[Path, str]:
     """Every generated file, by its path in the repository."""
-    files = cantools_sources() | parameter_sources()
+    files = cantools_sources() | parameter_sources() | fault_sources() | mode_page()
     files[FRAMES_DIR / "diarc_hash.h"] = hash_header()
     files[FRAMES_DIR / "diarc_scales.h"] = scales_header()
     return files

@@ -301,6 +301,7 @@ int diarc_estimate_pack(
     dst_p[7] |= pack_left_shift_u8(src_p->load_at_bound, 2u, 0x04u);
     dst_p[7] |= pack_left_shift_u8(src_p->valve_saturated, 3u, 0x08u);
     dst_p[7] |= pack_left_shift_u8(src_p->moving, 4u, 0x10u);
+    dst_p[7] |= pack_left_shift_u8(src_p->estimate_held, 5u, 0x20u);
 
     return (8);
 }
@@ -414,6 +415,16 @@ bool diarc_estimate_moving_is_in_range(uint8_t value)
 }
 
 bool diarc_estimate_moving_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 1.0));
+}
+
+bool diarc_estimate_estimate_held_is_in_range(uint8_t value)
+{
+    return (value <= 1u);
+}
+
+bool diarc_estimate_estimate_held_is_in_phys_range(double value)
 {
     return ((value >= 0.0) && (value <= 1.0));
 }

@@ -112,10 +112,34 @@ extern "C" {
 #define DIARC_NMT_COMMAND_RESET_NODE_CHOICE (129u)
 #define DIARC_NMT_COMMAND_RESET_COMMUNICATION_CHOICE (130u)
 
+#define DIARC_EMCY_ECU_FAULT_CODE_NONE_CHOICE (0u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_FRAMES_LOST_CHOICE (1u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_INVALID_CHOICE (2u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_FRAMES_CORRUPT_CHOICE (3u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_RANGE_CHOICE (4u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_RATE_CHOICE (5u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SENSOR_STUCK_CHOICE (6u)
+#define DIARC_EMCY_ECU_FAULT_CODE_MODEL_MISMATCH_CHOICE (7u)
+#define DIARC_EMCY_ECU_FAULT_CODE_JOINT_LIMIT_CHOICE (8u)
+#define DIARC_EMCY_ECU_FAULT_CODE_OVER_PRESSURE_CHOICE (9u)
+#define DIARC_EMCY_ECU_FAULT_CODE_CAVITATION_CHOICE (10u)
+#define DIARC_EMCY_ECU_FAULT_CODE_TRACKING_ERROR_CHOICE (11u)
+#define DIARC_EMCY_ECU_FAULT_CODE_VALVE_SATURATED_CHOICE (12u)
+#define DIARC_EMCY_ECU_FAULT_CODE_ESTIMATE_AT_BOUND_CHOICE (13u)
+#define DIARC_EMCY_ECU_FAULT_CODE_LATE_TICKS_CHOICE (14u)
+#define DIARC_EMCY_ECU_FAULT_CODE_DBC_MISMATCH_CHOICE (15u)
+#define DIARC_EMCY_ECU_FAULT_CODE_DUPLICATE_NODE_CHOICE (16u)
+#define DIARC_EMCY_ECU_FAULT_CODE_STORE_DAMAGED_CHOICE (17u)
+#define DIARC_EMCY_ECU_FAULT_CODE_HEARTBEAT_LOST_CHOICE (18u)
+#define DIARC_EMCY_ECU_FAULT_CODE_SEND_FAILED_CHOICE (19u)
+
 #define DIARC_ESTIMATE_MODE_INIT_CHOICE (0u)
 #define DIARC_ESTIMATE_MODE_STANDBY_CHOICE (1u)
 #define DIARC_ESTIMATE_MODE_RUN_CHOICE (2u)
 #define DIARC_ESTIMATE_MODE_TARE_CHOICE (3u)
+#define DIARC_ESTIMATE_MODE_COMMISSION_CHOICE (4u)
+#define DIARC_ESTIMATE_MODE_HOLD_CHOICE (5u)
+#define DIARC_ESTIMATE_MODE_SAFE_STOP_CHOICE (6u)
 #define DIARC_ESTIMATE_MODE_FAULT_CHOICE (15u)
 
 #define DIARC_ENCODERS_SENSOR_STATUS_GOOD_CHOICE (0u)
@@ -128,6 +152,9 @@ extern "C" {
 #define DIARC_MOTION_REQUEST_MOVE_CHOICE (3u)
 #define DIARC_MOTION_REQUEST_RESET_FAULT_CHOICE (4u)
 #define DIARC_MOTION_REQUEST_TARE_CHOICE (5u)
+#define DIARC_MOTION_REQUEST_HOLD_CHOICE (6u)
+#define DIARC_MOTION_REQUEST_COMMISSION_CHOICE (7u)
+#define DIARC_MOTION_REQUEST_SAFE_STOP_CHOICE (8u)
 
 #define DIARC_MOTION_JOINT_SWING_CHOICE (0u)
 #define DIARC_MOTION_JOINT_WRIST_CHOICE (1u)
@@ -140,6 +167,9 @@ extern "C" {
 #define DIARC_VALVES_MODE_STANDBY_CHOICE (1u)
 #define DIARC_VALVES_MODE_RUN_CHOICE (2u)
 #define DIARC_VALVES_MODE_TARE_CHOICE (3u)
+#define DIARC_VALVES_MODE_COMMISSION_CHOICE (4u)
+#define DIARC_VALVES_MODE_HOLD_CHOICE (5u)
+#define DIARC_VALVES_MODE_SAFE_STOP_CHOICE (6u)
 #define DIARC_VALVES_MODE_FAULT_CHOICE (15u)
 
 #define DIARC_VALVES_SWING_CONTROL_DISABLED_CHOICE (1u)
@@ -152,6 +182,9 @@ extern "C" {
 #define DIARC_TRACKING_MODE_STANDBY_CHOICE (1u)
 #define DIARC_TRACKING_MODE_RUN_CHOICE (2u)
 #define DIARC_TRACKING_MODE_TARE_CHOICE (3u)
+#define DIARC_TRACKING_MODE_COMMISSION_CHOICE (4u)
+#define DIARC_TRACKING_MODE_HOLD_CHOICE (5u)
+#define DIARC_TRACKING_MODE_SAFE_STOP_CHOICE (6u)
 #define DIARC_TRACKING_MODE_FAULT_CHOICE (15u)
 
 #define DIARC_TRACKING_TRACKING_JOINT_SWING_CHOICE (0u)
@@ -165,6 +198,9 @@ extern "C" {
 #define DIARC_PARAMETERS_MODE_STANDBY_CHOICE (1u)
 #define DIARC_PARAMETERS_MODE_RUN_CHOICE (2u)
 #define DIARC_PARAMETERS_MODE_TARE_CHOICE (3u)
+#define DIARC_PARAMETERS_MODE_COMMISSION_CHOICE (4u)
+#define DIARC_PARAMETERS_MODE_HOLD_CHOICE (5u)
+#define DIARC_PARAMETERS_MODE_SAFE_STOP_CHOICE (6u)
 #define DIARC_PARAMETERS_MODE_FAULT_CHOICE (15u)
 
 #define DIARC_PRESSURES_WRIST_SENSOR_STATUS_GOOD_CHOICE (0u)
@@ -175,6 +211,9 @@ extern "C" {
 #define DIARC_TIMING_MODE_STANDBY_CHOICE (1u)
 #define DIARC_TIMING_MODE_RUN_CHOICE (2u)
 #define DIARC_TIMING_MODE_TARE_CHOICE (3u)
+#define DIARC_TIMING_MODE_COMMISSION_CHOICE (4u)
+#define DIARC_TIMING_MODE_HOLD_CHOICE (5u)
+#define DIARC_TIMING_MODE_SAFE_STOP_CHOICE (6u)
 #define DIARC_TIMING_MODE_FAULT_CHOICE (15u)
 
 #define DIARC_TIMING_LAST_REFUSAL_NONE_CHOICE (0u)
@@ -188,10 +227,29 @@ extern "C" {
 #define DIARC_TIMING_LAST_REFUSAL_NO_FAULT_TO_RESET_CHOICE (8u)
 #define DIARC_TIMING_LAST_REFUSAL_UNKNOWN_REQUEST_CHOICE (9u)
 #define DIARC_TIMING_LAST_REFUSAL_NOT_DEPRESSURISED_CHOICE (10u)
+#define DIARC_TIMING_LAST_REFUSAL_STOPPING_CHOICE (11u)
+#define DIARC_TIMING_LAST_REFUSAL_CAUSE_PERSISTS_CHOICE (12u)
 
 #define DIARC_TIMING_FAULT_CODE_NONE_CHOICE (0u)
 #define DIARC_TIMING_FAULT_CODE_SENSOR_FRAMES_LOST_CHOICE (1u)
 #define DIARC_TIMING_FAULT_CODE_SENSOR_INVALID_CHOICE (2u)
+#define DIARC_TIMING_FAULT_CODE_SENSOR_FRAMES_CORRUPT_CHOICE (3u)
+#define DIARC_TIMING_FAULT_CODE_SENSOR_RANGE_CHOICE (4u)
+#define DIARC_TIMING_FAULT_CODE_SENSOR_RATE_CHOICE (5u)
+#define DIARC_TIMING_FAULT_CODE_SENSOR_STUCK_CHOICE (6u)
+#define DIARC_TIMING_FAULT_CODE_MODEL_MISMATCH_CHOICE (7u)
+#define DIARC_TIMING_FAULT_CODE_JOINT_LIMIT_CHOICE (8u)
+#define DIARC_TIMING_FAULT_CODE_OVER_PRESSURE_CHOICE (9u)
+#define DIARC_TIMING_FAULT_CODE_CAVITATION_CHOICE (10u)
+#define DIARC_TIMING_FAULT_CODE_TRACKING_ERROR_CHOICE (11u)
+#define DIARC_TIMING_FAULT_CODE_VALVE_SATURATED_CHOICE (12u)
+#define DIARC_TIMING_FAULT_CODE_ESTIMATE_AT_BOUND_CHOICE (13u)
+#define DIARC_TIMING_FAULT_CODE_LATE_TICKS_CHOICE (14u)
+#define DIARC_TIMING_FAULT_CODE_DBC_MISMATCH_CHOICE (15u)
+#define DIARC_TIMING_FAULT_CODE_DUPLICATE_NODE_CHOICE (16u)
+#define DIARC_TIMING_FAULT_CODE_STORE_DAMAGED_CHOICE (17u)
+#define DIARC_TIMING_FAULT_CODE_HEARTBEAT_LOST_CHOICE (18u)
+#define DIARC_TIMING_FAULT_CODE_SEND_FAILED_CHOICE (19u)
 
 #define DIARC_HEARTBEAT_ECU_NMT_STATE_BOOT_UP_CHOICE (0u)
 #define DIARC_HEARTBEAT_ECU_NMT_STATE_STOPPED_CHOICE (4u)
@@ -237,6 +295,7 @@ extern "C" {
 #define DIARC_ESTIMATE_LOAD_AT_BOUND_NAME "LoadAtBound"
 #define DIARC_ESTIMATE_VALVE_SATURATED_NAME "ValveSaturated"
 #define DIARC_ESTIMATE_MOVING_NAME "Moving"
+#define DIARC_ESTIMATE_ESTIMATE_HELD_NAME "EstimateHeld"
 #define DIARC_ENCODERS_E2E_CRC_NAME "E2eCrc"
 #define DIARC_ENCODERS_E2E_COUNTER_NAME "E2eCounter"
 #define DIARC_ENCODERS_SENSOR_STATUS_NAME "SensorStatus"
@@ -369,7 +428,7 @@ struct diarc_sync_t {
 /**
  * Signals in message EMCY_ECU.
  *
- * Emergency of the ECU, CiA 301; sent once when a fault is entered and once when it is left
+ * Emergency of the ECU, CiA 301; sent once for every fault that becomes active, with code 0 when the last one is gone
  *
  * All signal values are as on the CAN bus.
  */
@@ -396,6 +455,8 @@ struct diarc_emcy_ecu_t {
     uint8_t fault_code;
 
     /**
+     * Active faults, one bit per code
+     *
      * Range: 0..4294967295 (0..4294967295 -)
      * Scale: 1
      * Offset: 0
@@ -494,6 +555,15 @@ struct diarc_estimate_t {
      * Offset: 0
      */
     uint8_t moving;
+
+    /**
+     * A fault whose reaction is to degrade is active: the estimate rests
+     *
+     * Range: 0..1 (0..1 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t estimate_held;
 };
 
 /**
@@ -570,7 +640,7 @@ struct diarc_motion_t {
     uint8_t master_status;
 
     /**
-     * What to do; Joint, Target and Duration count with MOVE, Controller with RUN
+     * What to do; Joint, Target and Duration count with MOVE, Controller with RUN, HOLD and COMMISSION
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -1200,7 +1270,7 @@ struct diarc_timing_t {
     uint16_t period_us;
 
     /**
-     * First fault since the last reset; 0 = none
+     * First of the active faults; 0 = none
      *
      * Range: 0..255 (0..255 -)
      * Scale: 1
@@ -1706,6 +1776,28 @@ bool diarc_estimate_moving_is_in_range(uint8_t value);
  * @return true if in range, false otherwise.
  */
 bool diarc_estimate_moving_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_estimate_estimate_held_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_estimate_estimate_held_is_in_phys_range(double value);
 
 /**
  * Unpack message ENCODERS.

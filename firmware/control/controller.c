@@ -197,7 +197,7 @@ void controller_step(struct controller *controller, const struct machine *machin
         const scalar share = controller->kind == CONTROLLER_PID ? SCALAR(0) : machine->diarc[i].spool_lead;
         const scalar spool = valve_spool(&machine->cylinder[i], out->u);
         out->u = limit(spool + mul(share, spool - measured->spool[i]), SCALAR(-1), SCALAR(1));
-        trajectory_advance(&controller->trajectory[i]);
+        trajectory_advance(&controller->trajectory[i], constants->dt_s);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
         controller->law_m_before[k] = theta[k];

@@ -5,6 +5,7 @@
 
 #include "control/diarc.h"
 #include "control/estimator.h"
+#include "control/limits.h"
 #include "control/observer.h"
 #include "control/pid.h"
 #include "control/trajectory.h"
@@ -25,6 +26,7 @@ struct machine {
     struct pid_gains pid[JOINTS];
     gain observer_bandwidth; /* rad/s */
     struct estimator_parameters estimator;
+    struct limits limits;
 };
 
 /* What follows from the machine and dt once. */

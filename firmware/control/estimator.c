@@ -43,16 +43,27 @@ struct estimator_constants estimator_constants(const struct estimator_parameters
     return constants;
 }
 
-static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
-                        scalar law[], struct ud_factors *covariance)
+/* Commissioning knows a parameter to a quarter of its range. */
+#define WIDE_SD SCALAR(0.25)
+
+static void start_covariance(const struct prior prior[], uint8_t size, const scalar scale[],
+                             struct ud_factors *covariance)
 {
     variance P[UD_SIZE_MAX];
     for (uint8_t k = 0; k < size; k++) {
-        theta[k] = prior[k].value;
-        law[k] = prior[k].value;
         P[k] = variance_of(quot(prior[k].sd, scale[k]));
     }
     ud_start(covariance, size, P);
+}
+
+static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
+                        scalar law[], struct ud_factors *covariance)
+{
+    for (uint8_t k = 0; k < size; k++) {
+        theta[k] = prior[k].value;
+        law[k] = prior[k].value;
+    }
+    start_covariance(prior, size, scale, covariance);
 }
 
 void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
@@ -63,6 +74,30 @@ void estimator_start(struct estimator *estimator, const struct estimator_paramet
                 &estimator->covariance_m);
     start_block(parameters->h, THETA_H, constants->scale_h, estimator->theta_h, estimator->law_h,
                 &estimator->covariance_h);
+    estimator_resume(estimator);
+}
+
+void estimator_commission(struct estimator *estimator)
+{
+    variance wide[UD_SIZE_MAX];
+    for (uint8_t k = 0; k < UD_SIZE_MAX; k++) {
+        wide[k] = variance_of(WIDE_SD);
+    }
+    ud_start(&estimator->covariance_m, THETA_M, wide);
+    ud_start(&estimator->covariance_h, THETA_H, wide);
+    estimator->covariance_m.D[M_T] = VARIANCE(0);
+    estimator->theta_m[M_T] = SCALAR(0);
+    estimator->commissioning = true;
+    estimator_resume(estimator);
+}
+
+void estimator_operate(struct estimator *estimator, const struct estimator_parameters *parameters,
+                       const struct estimator_constants *constants)
+{
+    start_covariance(parameters->m, THETA_M, constants->scale_m, &estimator->covariance_m);
+    start_covariance(parameters->h, THETA_H, constants->scale_h, &estimator->covariance_h);
+    estimator->theta_m[M_T] = parameters->m[M_T].value;
+    estimator->commissioning = false;
     estimator_resume(estimator);
 }
 
@@ -79,6 +114,7 @@ static void start_filters(struct estimator *estimator)
         estimator->open[i] = (struct two_poles){0};
         estimator->previous_gate[i] = SCALAR(0);
         estimator->strikes[i] = 0;
+        estimator->strikes_h[i] = 0;
     }
     estimator->ramp = SCALAR(0);
 }
@@ -221,10 +257,14 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
         residual -= mul(column, e->theta_m[parameter]);
         phi[parameter] = mul(column, constants->scale_m[parameter]);
     }
-    walk(e, constants);
+    if (!e->commissioning) {
+        walk(e, constants);
+    }
     const variance innovation = update_block(&e->covariance_m, phi, constants->noise_m[i], residual,
                                              constants->scale_m, parameters->m, e->theta_m);
-    notice_changed_load(e, parameters, constants, i, residual, innovation);
+    if (!e->commissioning) {
+        notice_changed_load(e, parameters, constants, i, residual, innovation);
+    }
 }
 
 static void update_hydraulics(struct estimator *e, const struct estimator_parameters *parameters,
@@ -238,8 +278,15 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
         residual -= mul(column, e->theta_h[parameter]);
         phi[parameter] = mul(column, constants->scale_h[parameter]);
     }
-    (void)update_block(&e->covariance_h, phi, constants->noise_h[i], residual, constants->scale_h,
-                       parameters->h, e->theta_h);
+    const variance innovation = update_block(&e->covariance_h, phi, constants->noise_h[i], residual,
+                                             constants->scale_h, parameters->h, e->theta_h);
+    if (absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
+        e->strikes_h[i] = 0;
+    } else if (e->strikes_h[i] < UINT8_MAX) {
+        e->strikes_h[i]++;
+    } else {
+        /* enough */
+    }
 }
 
 /* sat_M: the law's estimate follows by at most `step` a tick. */
@@ -285,7 +332,7 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
     const bool mechanics = e->turn < JOINTS;
     e->turn = (uint8_t)((e->turn + 1u) % ROW_TURNS);
     e->since_update = e->since_update < ROW_TURNS ? (uint8_t)(e->since_update + 1u) : ROW_TURNS;
-    if (e->open[i].second > LEAST_OPEN) {
+    if (e->open[i].second > LEAST_OPEN && !e->held) {
         if (mechanics) {
             update_mechanics(e, parameters, constants, i);
         } else {

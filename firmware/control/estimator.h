@@ -100,11 +100,15 @@ struct estimator {
     scalar previous_gate[JOINTS];
     scalar ramp;             /* 0..1, brings the gate up smoothly after a start of the filters */
     uint8_t strikes[JOINTS]; /* innovations in a row that were too large */
-    uint16_t reopened;       /* how often a changed load was noticed; stops at 65535 */
-    uint8_t walk_updates;    /* updates since the load walked last */
-    uint8_t turn;            /* which row is updated next, 0..3 */
-    uint8_t samples;         /* since the restart, up to 2: balances need two */
-    bool updating;           /* an update was made within the last four ticks */
+    uint8_t
+        strikes_h[JOINTS]; /* the same of the hydraulics; stops at 255. Sensors that contradict one another */
+    uint16_t reopened;     /* how often a changed load was noticed; stops at 65535 */
+    bool held;             /* no update: what the sensors say is in doubt */
+    bool commissioning;    /* there is no load and everything else is open */
+    uint8_t walk_updates;  /* updates since the load walked last */
+    uint8_t turn;          /* which row is updated next, 0..3 */
+    uint8_t samples;       /* since the restart, up to 2: balances need two */
+    bool updating;         /* an update was made within the last four ticks */
     uint8_t since_update;
 };
 
@@ -113,6 +117,13 @@ struct estimator_constants estimator_constants(const struct estimator_parameters
 /* Everything back to the priors. */
 void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
                      const struct estimator_constants *constants);
+
+/* Commissioning: the load is none and stays so, all other parameters are open to a quarter of their ranges. */
+void estimator_commission(struct estimator *estimator);
+
+/* After commissioning: what was found stays, held as tightly as the priors say, and the load is open again. */
+void estimator_operate(struct estimator *estimator, const struct estimator_parameters *parameters,
+                       const struct estimator_constants *constants);
 
 /* Forget the samples, keep the estimate: after a gap in the measurements. */
 void estimator_resume(struct estimator *estimator);

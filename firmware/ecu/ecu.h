@@ -9,62 +9,23 @@
 #ifndef ECU_ECU_H
 #define ECU_ECU_H
 
+#include "control/safe_stop.h"
+#include "ecu/faults.h"
+#include "ecu/modes.h"
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
+#include "ecu/requests.h"
+#include "ecu/samples.h"
 #include "ecu/store.h"
+#include "ecu/supervision.h"
+#include "ecu/tare.h"
 
 #define ECU_NODE_ID 1u
 #define ECU_PERIOD_LOW_US 250u
 #define ECU_PERIOD_HIGH_US 20000u
 
-/* Valve set-points are zero and disabled in every mode but RUN. */
-enum ecu_mode {
-    MODE_INIT = 0,    /* waits for all sensors, or for NMT start */
-    MODE_STANDBY = 1, /* sensors good, valves shut */
-    MODE_RUN = 2,     /* the law drives the valves */
-    MODE_TARE = 3,    /* averages the pressure sensors with the pump off, then STANDBY */
-    MODE_FAULT = 15   /* until RESET_FAULT */
-};
-
 enum nmt_state { NMT_STOPPED = 4, NMT_OPERATIONAL = 5, NMT_PRE_OPERATIONAL = 127 };
-
-enum ecu_fault {
-    FAULT_NONE = 0,
-    FAULT_SENSOR_FRAMES_LOST = 1,
-    FAULT_SENSOR_INVALID = 2,
-    FAULT_STORE_DAMAGED = 17 /* from power-on until RESET_FAULT says that what is in use is wanted */
-};
-
-/* Why a request was not carried out; LastRefusal on the timing frame. */
-enum ecu_refusal {
-    REFUSAL_NONE,
-    REFUSAL_NOT_OPERATIONAL,
-    REFUSAL_NOT_IN_STANDBY,
-    REFUSAL_NOT_IN_RUN,
-    REFUSAL_SENSORS_NOT_FRESH,
-    REFUSAL_MOVE_UNDER_WAY,
-    REFUSAL_TARGET_OUT_OF_RANGE,
-    REFUSAL_DURATION_TOO_SHORT,
-    REFUSAL_NO_FAULT_TO_RESET,
-    REFUSAL_UNKNOWN_REQUEST,
-    REFUSAL_NOT_DEPRESSURISED
-};
-
-/* Raw samples of the last tick they were good in. */
-struct sensor_samples {
-    int32_t angle[JOINTS];
-    int32_t pressure[JOINTS][CHAMBERS];
-    int32_t spool[JOINTS];
-};
-
-/* Zero of the pressure sensors, found with all chambers at tank pressure. */
-struct tare {
-    uint16_t samples_left;
-    uint16_t samples;
-    int32_t sum[JOINTS][CHAMBERS];   /* raw */
-    scalar offset[JOINTS][CHAMBERS]; /* Pa */
-};
 
 struct ecu_counters {
     uint32_t ticks;      /* since the restart */
@@ -87,19 +48,25 @@ struct ecu {
     enum store_status stored; /* STORE_OK again once its fault is reset */
     enum ecu_mode mode;
     enum nmt_state nmt;
-    enum ecu_fault fault;
+    enum ecu_fault fault;   /* the one to show: the first of the active ones */
+    uint32_t active_faults; /* one bit per code */
+    struct supervision supervision;
     struct receive receive;
     struct sensor_samples samples;
     struct tare tare;
+    struct safe_stop stop;
     bool sampled;           /* samples hold a complete set */
-    uint8_t sensors_wrong;  /* ticks in a row that sensors were missing or wrong; stops at 255 */
     bool restart_requested; /* by NMT */
     bool boot_up_due;
-    bool run_requested;
     bool valves_active; /* the last valve frame opened them */
-    enum controller_kind run_controller;
-    uint8_t sync_counter; /* 1..240 */
-    uint8_t phase;        /* tick modulo the slow frames' cycle */
+    bool is_pending;    /* `pending` waits for this tick's samples */
+    enum ecu_event pending;
+    enum controller_kind requested_controller;
+    uint16_t control_word;       /* CiA 408, as last written */
+    uint32_t heartbeat_consumer; /* object 1016h: node << 16 | ms, 0: nobody */
+    uint32_t master_hash;        /* of the master's DBC, object 2002h; 0: not told */
+    uint8_t sync_counter;        /* 1..240 */
+    uint8_t phase;               /* tick modulo the slow frames' cycle */
     uint8_t next_parameter, next_page, next_joint;
     uint16_t heartbeat_ticks; /* to the next heartbeat */
     uint8_t tx_counter[ECU_TX_COUNTERS];
@@ -123,7 +90,16 @@ void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);
 void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port);
 
-/* Valves to zero and disabled, once, now: for a port that is about to stop. */
+/* For a port that is about to stop: SAFE_STOP where the valves are driven; go on ticking until ecu_valves_shut. */
+void ecu_request_safe_stop(struct ecu *ecu);
+
+/* The last valve frame was zero and disabled. */
+bool ecu_valves_shut(const struct ecu *ecu);
+
+/* Strict pace: so many periods of the timer were missed before this tick. */
+void ecu_note_late_start(struct ecu *ecu, uint32_t missed_periods);
+
+/* Valves to zero and disabled, once, now: for a port that cannot tick any more. */
 void ecu_shutdown(struct ecu *ecu, const struct ecu_port *port);
 
 #endif

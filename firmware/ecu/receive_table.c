@@ -41,6 +41,7 @@ enum receive_result receive_accept(struct receive *receive, const struct can_fra
         result = RECEIVE_COUNTER;
     }
     if (result != RECEIVE_GOOD) {
+        state->spoiled = true;
         if (receive->refused < UINT8_MAX) {
             receive->refused++;
         }
@@ -60,6 +61,7 @@ void receive_begin_tick(struct receive *receive, uint8_t sync_counter)
     receive->expected = (uint8_t)((sync_counter - 1u) % E2E_COUNTER_STATES);
     for (uint8_t k = 0; k < RX_FRAMES; k++) {
         receive->row[k].fresh = false;
+        receive->row[k].spoiled = false;
     }
 }
 

@@ -24,6 +24,7 @@ enum receive_result {
 struct receive_state {
     bool heard;      /* at least once since the restart */
     bool fresh;      /* a good frame came in this tick */
+    bool spoiled;    /* one that was refused did */
     uint8_t counter; /* of the last good frame */
     uint8_t data[8]; /* of the last good frame */
 };

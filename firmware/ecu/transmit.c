@@ -33,17 +33,28 @@ struct can_frame_11bit transmit_heartbeat(uint8_t nmt_state)
         .id = DIARC_HEARTBEAT_ECU_FRAME_ID, .length = DIARC_HEARTBEAT_ECU_LENGTH, .data = {nmt_state}};
 }
 
-struct can_frame_11bit transmit_emergency(const struct ecu *ecu, uint16_t code)
+struct can_frame_11bit transmit_emergency(const struct ecu *ecu, enum ecu_fault fault)
 {
     const struct diarc_emcy_ecu_t message = {
-        .error_code = code,
-        .error_register = code != 0u ? 0x81u : 0u, /* generic, manufacturer specific */
-        .fault_code = (uint8_t)ecu->fault,
-        .fault_detail = ecu->counters.ticks,
+        .error_code = fault_table[fault].emergency,
+        .error_register = fault_error_register(ecu),
+        .fault_code = (uint8_t)fault,
+        .fault_detail = ecu->active_faults,
     };
     struct can_frame_11bit frame = {.id = DIARC_EMCY_ECU_FRAME_ID, .length = DIARC_EMCY_ECU_LENGTH};
     (void)diarc_emcy_ecu_pack(frame.data, &message, sizeof frame.data);
     return frame;
+}
+
+bool transmit_send(struct ecu *ecu, const struct ecu_port *port, struct can_frame_11bit frame)
+{
+    if (port->send(port->context, &frame) == PORT_OK) {
+        return true;
+    }
+    if (ecu->counters.send_drops < UINT16_MAX) {
+        ecu->counters.send_drops++;
+    }
+    return false;
 }
 
 static int16_t spool_raw(scalar u)
@@ -53,7 +64,7 @@ static int16_t spool_raw(scalar u)
 
 struct can_frame_11bit transmit_valves(struct ecu *ecu)
 {
-    const bool active = ecu->mode == MODE_RUN;
+    const bool active = mode_drives(ecu->mode);
     const struct joint_output *const out = ecu->controller.output;
     const struct diarc_valves_t message = {
         .mode = (uint8_t)ecu->mode,
@@ -88,6 +99,7 @@ struct can_frame_11bit transmit_estimate(struct ecu *ecu)
         .valve_saturated = out[SWING].saturated || out[WRIST].saturated,
         .moving = controller->armed && (trajectory_moving(&controller->trajectory[SWING]) ||
                                         trajectory_moving(&controller->trajectory[WRIST])),
+        .estimate_held = estimator->held,
     };
     struct can_frame_11bit frame = {.id = DIARC_ESTIMATE_FRAME_ID, .length = DIARC_ESTIMATE_LENGTH};
     (void)diarc_estimate_pack(frame.data, &message, sizeof frame.data);

@@ -6,8 +6,11 @@
 
 struct can_frame_11bit transmit_sync(uint8_t sync_counter);
 struct can_frame_11bit transmit_heartbeat(uint8_t nmt_state);
-/* code: CiA 301 error code, 0 when the fault is gone. */
-struct can_frame_11bit transmit_emergency(const struct ecu *ecu, uint16_t code);
+/* FAULT_NONE: the last fault is gone. */
+struct can_frame_11bit transmit_emergency(const struct ecu *ecu, enum ecu_fault fault);
+
+/* Hand a frame to the port; what it does not take is counted. False then. */
+bool transmit_send(struct ecu *ecu, const struct ecu_port *port, struct can_frame_11bit frame);
 
 /* These carry E2E protection; each call advances the frame's counter. */
 struct can_frame_11bit transmit_valves(struct ecu *ecu);

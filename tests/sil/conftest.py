@@ -54,6 +54,39 @@ def paper() -> Scenario:
 # ---- the ECU on the bench ------------------------------------------------------------------------
 
 
+# No supervision but that of frames: for tests that show the ECU sensor values no arm could have.
+OPEN_LIMITS = {
+    "supervision.angle_range_rad": 7.0,
+    "supervision.angle_margin_rad": 7.0,
+    "supervision.tracking_error_rad": 7.0,
+    "supervision.swing.rate_rad_s": 30.0,
+    "supervision.wrist.rate_rad_s": 30.0,
+    "supervision.pressure_range_Pa": 3.2767e7,
+    "supervision.pressure_max_Pa": 3.2767e7,
+    "supervision.pressure_step_Pa": 3.3e7,
+    "supervision.pressure_min_Pa": 0.0,
+    "supervision.stuck_rad": 30.0,
+    "supervision.stuck_s": 30.0,
+    "supervision.saturation_s": 30.0,
+    "supervision.bound_s": 30.0,
+    "supervision.mismatch_updates": 30.0,
+}
+REQUESTS = {
+    code: str(name)
+    for code, name in protocol.database().get_message_by_name("MOTION").get_signal_by_name("Request").choices.items()
+}
+
+
+@pytest.fixture(scope="session")
+def open_image(machine: Machine) -> Callable[..., bytes]:
+    """Parameter images with the limits wide open: ``open_image(changes)``."""
+
+    def image_of(changes: dict[str, float] | None = None) -> bytes:
+        return parameter_image(machine, OPEN_LIMITS | (changes or {}))
+
+    return image_of
+
+
 class Bench:
     """The firmware in this process, with hand-made sensors in the place of a plant.
 
@@ -85,7 +118,7 @@ class Bench:
 
     def motion(self, request: str, **raw: int) -> np.ndarray:
         """A motion command; request by its name in the DBC."""
-        number = {"STANDBY": 1, "RUN": 2, "MOVE": 3, "RESET_FAULT": 4}[request]
+        number = {name: code for code, name in REQUESTS.items()}[request]
         self.motions += 1
         return self.row("MOTION", {"Request": number, "Duration": 1} | raw, self.motions % 15)
 
@@ -112,6 +145,11 @@ class Bench:
     def run(self, controller: int = 2) -> None:
         """Arm; in RUN afterwards."""
         self.tick([self.motion("RUN", Controller=controller)])
+
+    def to_standby(self) -> None:
+        """Back to STANDBY at once: the network stops and starts."""
+        self.tick([session.nmt_frame(session.NMT_STOP)])
+        self.tick([session.nmt_frame(session.NMT_START)])
 
     def mode(self) -> str:
         """Mode on the next valve frame."""

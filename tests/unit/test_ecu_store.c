@@ -162,6 +162,7 @@ static void expect_stored(bool is_stored)
 /* In FAULT with the emergency sent once, valves shut; RESET_FAULT leads to STANDBY, and a reset does not ask again. */
 static void expect_confirmation_asked(void)
 {
+    tick();
     TEST_ASSERT_EQUAL_INT(MODE_FAULT, ecu.mode);
     TEST_ASSERT_EQUAL_INT(FAULT_STORE_DAMAGED, ecu.fault);
     queue_nmt(NMT_START);

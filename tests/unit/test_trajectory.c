@@ -41,7 +41,7 @@ static void record(void)
     TEST_ASSERT_TRUE(begin());
     for (int k = 0; k <= TICKS; k++) {
         samples[k] = trajectory_now(&trajectory);
-        trajectory_advance(&trajectory);
+        trajectory_advance(&trajectory, from_real(DT_S));
     }
 }
 
@@ -69,7 +69,7 @@ static void test_move_does_not_end_at_rest_at_its_target(void)
     TEST_ASSERT_TRUE(begin());
     for (int k = 0; k < TICKS; k++) {
         TEST_ASSERT_TRUE(trajectory_moving(&trajectory));
-        trajectory_advance(&trajectory);
+        trajectory_advance(&trajectory, from_real(DT_S));
     }
     TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
 }
@@ -83,7 +83,7 @@ static void test_end_point_creeps_away_over_many_moves(void)
         const scalar target = from_real(lcg_uniform(&noise, -1, 1.2));
         TEST_ASSERT_TRUE(trajectory_start(&trajectory, target, 7, from_real(DT_S)));
         for (int k = 0; k < 7; k++) {
-            trajectory_advance(&trajectory);
+            trajectory_advance(&trajectory, from_real(DT_S));
         }
         TEST_ASSERT_FALSE(trajectory_moving(&trajectory));
         TEST_ASSERT_DOUBLE_WITHIN(2 * STEP, real(target), real(trajectory_now(&trajectory).q));
@@ -145,7 +145,7 @@ static void test_new_target_takes_over_half_way(void)
     /* GIVEN a move under way WHEN another is asked for THEN refused, and the first goes on undisturbed */
     TEST_ASSERT_TRUE(begin());
     for (int k = 0; k < 700; k++) {
-        trajectory_advance(&trajectory);
+        trajectory_advance(&trajectory, from_real(DT_S));
     }
     const struct trajectory before = trajectory;
     TEST_ASSERT_FALSE(trajectory_start(&trajectory, SCALAR(-0.9), 100, from_real(DT_S)));
@@ -169,12 +169,12 @@ static void test_rest_drifts(void)
     record();
     const struct reference end = trajectory_now(&trajectory);
     for (int k = 0; k < 1000; k++) {
-        trajectory_advance(&trajectory);
+        trajectory_advance(&trajectory, from_real(DT_S));
         const struct reference now = trajectory_now(&trajectory);
         TEST_ASSERT_TRUE(now.q == end.q && now.w == SCALAR(0) && now.a == SCALAR(0));
     }
     TEST_ASSERT_TRUE(trajectory_start(&trajectory, from_real(START_RAD), 1, from_real(DT_S)));
-    trajectory_advance(&trajectory);
+    trajectory_advance(&trajectory, from_real(DT_S));
     TEST_ASSERT_DOUBLE_WITHIN(STEP, START_RAD, real(trajectory_now(&trajectory).q));
 }
 

@@ -1,0 +1,143 @@
+#include "ecu/samples.h"
+
+#include "can_protocol/generated/diarc.h"
+#include "ecu/ecu.h"
+#include "ecu/wire.h"
+
+#define SENSOR_STATUS_INVALID DIARC_ENCODERS_SENSOR_STATUS_INVALID_CHOICE
+
+static scalar angle_of(int32_t raw)
+{
+    return WIRE_DECODE(raw, DIARC_ENCODERS_SWING_ANGLE, 0);
+}
+
+static scalar pressure_of(const struct ecu *ecu, int32_t raw)
+{
+    return WIRE_DECODE(raw, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure);
+}
+
+/* A frame that did not come, or was refused. */
+static enum ecu_fault missing(const struct ecu *ecu, enum received_frame row)
+{
+    return ecu->receive.row[row].spoiled ? FAULT_SENSOR_FRAMES_CORRUPT : FAULT_SENSOR_FRAMES_LOST;
+}
+
+static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t raw, int32_t before)
+{
+    const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
+    const scalar beyond = ecu->machine.limits.angle_range;
+    const scalar q = angle_of(raw);
+    if (q < cylinder->q_min - beyond || q > cylinder->q_max + beyond) {
+        return FAULT_SENSOR_RANGE;
+    }
+    /* the sample before may be the prediction: an increment over one tick all the same */
+    const scalar most = mul(ecu->machine.limits.rate[i], ecu->constants.dt_s);
+    const bool too_fast = ecu->controller.armed && absolute(angle_of(raw - before)) > most;
+    return too_fast ? FAULT_SENSOR_RATE : FAULT_NONE;
+}
+
+static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t before)
+{
+    const struct limits *const limits = &ecu->machine.limits;
+    if (pressure_of(ecu, raw) > limits->pressure_range) {
+        return FAULT_SENSOR_RANGE;
+    }
+    /* what was kept over missing frames may have changed meanwhile; a value that was refused may not */
+    const enum ecu_fault cause = ecu->supervision.wrong_cause;
+    const bool kept = cause == FAULT_SENSOR_FRAMES_LOST || cause == FAULT_SENSOR_FRAMES_CORRUPT;
+    const int32_t ticks = kept ? 1 + (int32_t)ecu->supervision.sensors_wrong : 1;
+    const scalar step = absolute(pressure_of(ecu, (raw - before) / ticks));
+    return ecu->controller.armed && step > limits->pressure_step ? FAULT_SENSOR_RATE : FAULT_NONE;
+}
+
+static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *samples)
+{
+    if (!ecu->receive.row[RX_ENCODERS].fresh) {
+        return missing(ecu, RX_ENCODERS);
+    }
+    struct diarc_encoders_t raw = {0};
+    (void)diarc_encoders_unpack(&raw, ecu->receive.row[RX_ENCODERS].data, DIARC_ENCODERS_LENGTH);
+    if (raw.sensor_status == SENSOR_STATUS_INVALID || raw.swing_angle == WIRE_INVALID_S24 ||
+        raw.wrist_angle == WIRE_INVALID_S24) {
+        return FAULT_SENSOR_INVALID;
+    }
+    enum ecu_fault wrong = judge_angle(ecu, SWING, raw.swing_angle, samples->angle[SWING]);
+    if (wrong == FAULT_NONE) {
+        wrong = judge_angle(ecu, WRIST, raw.wrist_angle, samples->angle[WRIST]);
+    }
+    if (wrong == FAULT_NONE) {
+        samples->angle[SWING] = raw.swing_angle;
+        samples->angle[WRIST] = raw.wrist_angle;
+    }
+    return wrong;
+}
+
+static enum ecu_fault take_pressures(const struct ecu *ecu, enum joint i, struct sensor_samples *samples)
+{
+    const enum received_frame row = i == SWING ? RX_PRESSURES_SWING : RX_PRESSURES_WRIST;
+    if (!ecu->receive.row[row].fresh) {
+        return missing(ecu, row);
+    }
+    /* Both frames have the same layout; the DBC has two only because identifiers differ. */
+    struct diarc_pressures_swing_t raw = {0};
+    (void)diarc_pressures_swing_unpack(&raw, ecu->receive.row[row].data, DIARC_PRESSURES_SWING_LENGTH);
+    if (raw.sensor_status == SENSOR_STATUS_INVALID || raw.bore_pressure == WIRE_INVALID_U16 ||
+        raw.annulus_pressure == WIRE_INVALID_U16 || raw.spool_position == WIRE_INVALID_S16) {
+        return FAULT_SENSOR_INVALID;
+    }
+    enum ecu_fault wrong = judge_pressure(ecu, raw.bore_pressure, samples->pressure[i][BORE]);
+    if (wrong == FAULT_NONE) {
+        wrong = judge_pressure(ecu, raw.annulus_pressure, samples->pressure[i][ANNULUS]);
+    }
+    if (wrong == FAULT_NONE) {
+        samples->pressure[i][BORE] = raw.bore_pressure;
+        samples->pressure[i][ANNULUS] = raw.annulus_pressure;
+        samples->spool[i] = raw.spool_position;
+    }
+    return wrong;
+}
+
+/* The sample a missing or wrong angle is replaced by: the reference and the observer's prediction. */
+static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
+{
+    const struct controller *const c = &ecu->controller;
+    const scalar e1 = c->observer[i].e + mul(ecu->constants.dt_s, c->observer[i].w);
+    const scalar q = trajectory_now(&c->trajectory[i]).q + e1;
+    return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
+}
+
+/* The later in this order says more: lost, corrupt, invalid, out of range, too fast. */
+static enum ecu_fault worse(enum ecu_fault a, enum ecu_fault b)
+{
+    static const uint8_t RANK[] = {[FAULT_NONE] = 0,           [FAULT_SENSOR_FRAMES_LOST] = 1,
+                                   [FAULT_SENSOR_INVALID] = 3, [FAULT_SENSOR_FRAMES_CORRUPT] = 2,
+                                   [FAULT_SENSOR_RANGE] = 4,   [FAULT_SENSOR_RATE] = 5};
+    return RANK[a] >= RANK[b] ? a : b;
+}
+
+enum ecu_fault samples_take(struct ecu *ecu)
+{
+    struct sensor_samples *const samples = &ecu->samples;
+    enum ecu_fault wrong = take_angles(ecu, samples);
+    if (wrong != FAULT_NONE && ecu->controller.armed) {
+        samples->angle[SWING] = predicted_angle(ecu, SWING);
+        samples->angle[WRIST] = predicted_angle(ecu, WRIST);
+    }
+    wrong = worse(wrong, take_pressures(ecu, SWING, samples));
+    return worse(wrong, take_pressures(ecu, WRIST, samples));
+}
+
+struct measurement samples_measured(const struct ecu *ecu, const struct sensor_samples *before)
+{
+    struct measurement m;
+    const struct sensor_samples *const now = &ecu->samples;
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        m.q[i] = angle_of(now->angle[i]);
+        /* the difference of the integers: exact, whatever the number type */
+        m.dq[i] = angle_of(now->angle[i] - before->angle[i]);
+        m.p[i][BORE] = pressure_of(ecu, now->pressure[i][BORE]) - ecu->tare.offset[i][BORE];
+        m.p[i][ANNULUS] = pressure_of(ecu, now->pressure[i][ANNULUS]) - ecu->tare.offset[i][ANNULUS];
+        m.spool[i] = WIRE_DECODE(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
+    }
+    return m;
+}
