@@ -28,7 +28,8 @@ static void count_u16(uint16_t *counter)
     }
 }
 
-/* Back to the state of power-on; parameters stay. Field by field: a copy of the whole would need its size in stack. */
+/* Back to the state of power-on; parameters stay, and valves_active: when the bus did not take the frame that shuts
+ * them it is sent again. Field by field: a copy of the whole would need its size in stack. */
 static void restart(struct ecu *ecu)
 {
     ecu->mode = MODE_INIT;
@@ -42,7 +43,6 @@ static void restart(struct ecu *ecu)
     ecu->sampled = false;
     ecu->restart_requested = false;
     ecu->boot_up_due = true;
-    ecu->valves_active = false;
     ecu->is_pending = false;
     ecu->pending = EVENT_STANDBY;
     ecu->requested_controller = CONTROLLER_DIARC;
