@@ -29,7 +29,8 @@ static void count_u16(uint16_t *counter)
     }
 }
 
-/* Back to the state of power-on; parameters stay. Field by field: a copy of the whole would need its size in stack. */
+/* Back to the state of power-on; parameters stay, and valves_active: when the bus did not take the frame that shuts
+ * them it is sent again. Field by field: a copy of the whole would need its size in stack. */
 static void restart(struct ecu *ecu)
 {
     ecu->mode = MODE_INIT;
@@ -43,7 +44,6 @@ static void restart(struct ecu *ecu)
     ecu->sampled = false;
     ecu->restart_requested = false;
     ecu->boot_up_due = true;
-    ecu->valves_active = false;
     ecu->is_pending = false;
     ecu->pending = EVENT_STANDBY;
     ecu->requested_controller = CONTROLLER_DIARC;
@@ -89,6 +89,24 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
     return ECU_OK;
 }
 
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry)
+{
+    enum store_status stored = store != NULL ? store_load(store, buffer) : STORE_EMPTY;
+    const bool found = stored == STORE_OK || stored == STORE_OLDER;
+    enum ecu_status status = ECU_OK;
+    if (found) {
+        status = ecu_init(ecu, buffer, period_us, entry);
+    }
+    if (!found || status != ECU_OK) {
+        stored = found ? STORE_FOREIGN : stored;
+        status = ecu_init(ecu, fallback, period_us, entry);
+    }
+    ecu->stored = stored;
+    return status;
+}
+
 static void send_valves(struct ecu *ecu, const struct ecu_port *port)
 {
     if (transmit_send(ecu, port, transmit_valves(ecu))) {
@@ -119,6 +137,9 @@ void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
     if (ecu->boot_up_due) {
         (void)transmit_send(ecu, port, transmit_heartbeat(0));
         ecu->boot_up_due = false;
+        if (ecu->stored != STORE_OK && ecu->stored != STORE_EMPTY) {
+            fault_raise(ecu, port, FAULT_STORE_DAMAGED);
+        }
     }
     ecu->sync_counter = (uint8_t)(ecu->sync_counter % SYNC_COUNTER_LAST + 1u);
     receive_begin_tick(&ecu->receive, ecu->sync_counter);

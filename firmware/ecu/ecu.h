@@ -20,6 +20,7 @@
 #include "ecu/requests.h"
 #include "ecu/samples.h"
 #include "ecu/sdo_server.h"
+#include "ecu/store.h"
 #include "ecu/supervision.h"
 #include "ecu/tare.h"
 
@@ -51,6 +52,7 @@ struct ecu {
     struct controller_constants constants;
     struct controller controller;
     uint32_t period_us;
+    enum store_status stored; /* STORE_OK again once its fault is reset */
     enum ecu_mode mode;
     enum nmt_state nmt;
     enum ecu_fault fault;   /* the one to show: the first of the active ones */
@@ -88,6 +90,13 @@ struct ecu {
  * not usable, and with ECU_PARAMETER_RANGE *entry is the parameter's number (parameter_name). */
 enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, uint32_t period_us,
                          uint16_t *entry);
+
+/* The same from what is stored. `fallback` (NULL: the reference arm) is used when nothing is, and also when what is
+ * stored is damaged or this firmware refuses it; the latter, or an older set than the last one saved, is fault
+ * STORE_DAMAGED. `store` NULL: nothing survives. *buffer is overwritten. */
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry);
 
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);

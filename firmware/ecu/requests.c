@@ -53,6 +53,7 @@ enum ecu_refusal request_event(struct ecu *ecu, const struct ecu_port *port, enu
         ecu->is_pending = false; /* the later request wins */
     }
     if (event == EVENT_RESET_FAULT && refusal == REFUSAL_NONE) {
+        ecu->stored = STORE_OK; /* confirmed: a restart does not ask again */
         fault_clear_all(ecu, port);
         (void)operation_event(ecu, EVENT_SENSORS_READY);
     }
