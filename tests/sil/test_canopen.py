@@ -420,6 +420,8 @@ def test_pdo_is_not_without_names(bench: Bench) -> None:
     node.tpdo.read()
     node.rpdo.read()
     expected = {pdo.frame: pdo for pdo in load_objects().pdos}
+    # all by SDO first: in STANDBY the estimate rests, and a slow machine loses answers among all the frames
+    estimated, mapped = node.sdo["Estimated load"].raw, node.sdo["ESTIMATE"]["Load"].phys
     bench.network.bus.set_filters(None)
     maps = {m.cob_id: m for m in (*node.tpdo.map.values(), *node.rpdo.map.values())}
     assert set(maps) == {pdo.cob_id & 0x7FF for pdo in expected.values()}
@@ -445,10 +447,9 @@ def test_pdo_is_not_without_names(bench: Bench) -> None:
                 compared += 1
         assert compared >= 4, name
     node.tpdo[1].wait_for_reception(LIMIT_S)
-    bench.network.bus.set_filters(SERVICES)
     load = node.tpdo["ESTIMATE.Load"].phys
-    assert load == pytest.approx(node.sdo["Estimated load"].raw, abs=1e-3)
-    assert node.sdo["ESTIMATE"]["Load"].phys == pytest.approx(load, abs=1e-3)
+    assert load == pytest.approx(estimated, abs=1e-3)
+    assert load == pytest.approx(mapped, abs=1e-3)
 
 
 def test_silence_of_the_plant_does_not_slow_the_client(bench: Bench) -> None:
