@@ -220,11 +220,14 @@ def test_no_include_points_the_wrong_way() -> None:
 
 
 def test_no_call_leaves_but_through_the_port() -> None:
-    """GIVEN control/ and ecu/ THEN the port's functions are the only ones that are called through a pointer."""
+    """GIVEN control/ and ecu/ THEN the ports' functions are the only ones that are called through a pointer."""
     assert function_pointers(ROOT) == [
         "firmware/ecu/port.h: send",
         "firmware/ecu/port.h: receive",
         "firmware/ecu/port.h: now_us",
+        "firmware/ecu/store.h: read",
+        "firmware/ecu/store.h: erase",
+        "firmware/ecu/store.h: program",
     ]
 
 
