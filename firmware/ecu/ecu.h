@@ -10,13 +10,16 @@
 #define ECU_ECU_H
 
 #include "control/safe_stop.h"
+#include "ecu/emergency.h"
 #include "ecu/faults.h"
 #include "ecu/modes.h"
+#include "ecu/parameter_set.h"
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
 #include "ecu/requests.h"
 #include "ecu/samples.h"
+#include "ecu/sdo_server.h"
 #include "ecu/store.h"
 #include "ecu/supervision.h"
 #include "ecu/tare.h"
@@ -36,11 +39,15 @@ struct ecu_counters {
     uint16_t tick_time_us; /* last sensor frame to valve frame, of the last tick; stops at 65535 */
 };
 
-#define ECU_TX_COUNTERS 5
+/* Frames with E2E protection, by who counts them. */
+enum sent_frame { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING, TX_FRAMES };
 
 /* All of the ECU; a port owns one and looks into it only to report. */
 struct ecu {
-    struct machine machine;
+    struct parameter_image
+        image; /* the set in force, from which all of machine, bases and constants follow */
+    struct parameter_set_coming coming;
+    struct machine machine; /* not there while a set is coming: parameter_set.h */
     struct bases bases;
     struct controller_constants constants;
     struct controller controller;
@@ -68,9 +75,14 @@ struct ecu {
     uint8_t sync_counter;        /* 1..240 */
     uint8_t phase;               /* tick modulo the slow frames' cycle */
     uint8_t next_parameter, next_page, next_joint;
-    uint16_t heartbeat_ticks; /* to the next heartbeat */
-    uint8_t tx_counter[ECU_TX_COUNTERS];
-    uint32_t complete_at_us; /* when the last sensor frame of this tick came */
+    uint16_t heartbeat_ms;      /* object 1017h; 0: none is sent */
+    uint32_t heartbeat_ticks;   /* to the next heartbeat */
+    uint16_t refused_parameter; /* object 200Eh */
+    struct emergency_history emergencies;
+    struct sdo_server sdo;
+    uint8_t tx_counter[TX_FRAMES];
+    uint8_t sent[TX_FRAMES][8]; /* data of the last frame of each */
+    uint32_t complete_at_us;    /* when the last sensor frame of this tick came */
     struct ecu_counters counters;
 };
 
