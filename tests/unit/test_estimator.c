@@ -184,6 +184,7 @@ static struct estimator_sample sample_at(uint32_t k)
     for (uint8_t i = 0; i < JOINTS; i++) {
         sample.dq[i] = from_real(now.q[i] - before.q[i]);
         sample.reference_w[i] = from_real(now.w[i]);
+        sample.friction_sign[i] = coulomb_sign(&machine.arm, sample.reference_w[i]);
         sample.cylinder[i] = cylinder_at(&machine.cylinder[i], &cylinders[i], from_real(now.q[i]));
         sample.lever[i] = SCALAR(1);
         sample.force[i] = per_unit(force_N(t, i), bases.pressure + bases.area);
@@ -250,7 +251,8 @@ static void test_rates_wrong_at_the_shortest_or_the_longest_period(void)
         const struct estimator_constants c = estimator_constants(parameters, dt_s);
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_tick) * real(dt_s));
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK * real(c.filter), real(c.filter),
-                                  real_gain(c.filter_rate) * real(dt_s));
+                                  real_gain(c.filter_rate) * ROW_TURNS * real(dt_s));
+        TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_window) * ROW_TURNS * real(dt_s));
     }
 }
 
@@ -483,6 +485,7 @@ static struct estimator_sample steady_turn(void)
     struct estimator_sample sample = sample_at(rest);
     sample.dq[SWING] = from_real(0.3 * DT_S);
     sample.reference_w[SWING] = SCALAR(0.3);
+    sample.friction_sign[SWING] = coulomb_sign(&machine.arm, SCALAR(0.3));
     sample.force[SWING] = per_unit(torque_Nm / lever_arm_m(rest, SWING), bases.pressure + bases.area);
     return sample;
 }
@@ -516,6 +519,7 @@ static void test_load_forgotten_at_another_rate(void)
     restart_estimator();
     run(0, MOVE_TICKS + REST_TICKS);
     const struct estimator_sample steady = steady_turn();
+    estimator_resume(&estimator);    /* no torque is behind the jump to 0.3 rad/s */
     for (int k = 0; k < 1000; k++) { /* the turn's beginning tells of the load */
         estimator_step(&estimator, parameters, &constants, &machine.arm, &steady);
     }
