@@ -4,7 +4,7 @@
 
 #include <stddef.h>
 
-#include "control/controller.h"
+#include "ecu/ecu.h"
 #include "ports/cortex_m/clock.h"
 #include "ports/cortex_m/registers.h"
 #include "ports/cortex_m/slcan_text.h"
