@@ -31,12 +31,12 @@ static const scalar ARCTANGENT[] = {
 };
 #endif
 
-static scalar odd_polynomial(const scalar *coefficient, uint8_t terms, scalar x)
+static inline scalar odd_polynomial(const scalar *coefficient, uint8_t terms, scalar x)
 {
     const scalar y = mul(x, x);
     scalar p = coefficient[terms - 1];
     for (uint8_t k = (uint8_t)(terms - 1); k > 0; k--) {
-        p = mul(p, y) + coefficient[k - 1];
+        p = narrow(add_product(wide_of(coefficient[k - 1]), p, y));
     }
     return mul(p, x);
 }

@@ -237,7 +237,7 @@ static inline uint16_t carrying_pressure(enum joint i, const struct reference no
     const scalar a[JOINTS] = {now[SWING].a, now[WRIST].a};
     const struct wrist_trig trig = wrist_trig(arm, now[WRIST].q);
     struct arm_row row;
-    arm_inverse_dynamics(arm, &trig, i, w, a, SCALAR(1), &row);
+    arm_inverse_dynamics(arm, &trig, i, w, a, coulomb_sign(arm, w[i]), SCALAR(1), &row);
     scalar theta[THETA_M];
     for (uint8_t k = 0; k < THETA_M; k++) {
         theta[k] = ecu.machine.estimator.m[k].value;

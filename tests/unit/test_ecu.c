@@ -406,7 +406,7 @@ static void test_friction_of_the_cylinder_taken_for_the_joints(void)
         sensors.angle[SWING] = angle_raw(0.8);
         sensors.angle[WRIST] = angle_raw(-0.7);
         to_standby();
-        tick();
+        ticks(2 * ROW_TURNS);
         for (uint8_t i = 0; i < JOINTS; i++) {
             const struct cylinder *const cylinder = &ecu.machine.cylinder[i];
             const struct cylinder_constants *const constants = &ecu.constants.cylinder[i];
@@ -414,7 +414,7 @@ static void test_friction_of_the_cylinder_taken_for_the_joints(void)
             const scalar q = i == SWING ? SCALAR(0.8) : SCALAR(-0.7);
             const double expected = at_cylinder == 1 ? real(cylinder_at(cylinder, constants, q).R) / R0 : 1;
             TEST_ASSERT_TRUE(at_cylinder == 0 || fabs(expected - 1) > 0.05);
-            TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected, real(ecu.controller.estimator.previous.lever[i]));
+            TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected, real(ecu.controller.estimator.mechanics[i].lever));
         }
     }
 }

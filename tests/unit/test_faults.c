@@ -702,11 +702,11 @@ static void test_contradicting_sensors_not_noticed(void)
     for (uint8_t i = 0; i < JOINTS; i++) {
         setUp();
         to_run(CONTROLLER_DIARC);
-        ecu.controller.estimator.strikes_h[i] = (uint8_t)(most - 1u);
+        ecu.controller.estimator.hydraulics[i].strikes = (uint8_t)(most - 1u);
         expect_none(10);
-        ecu.controller.estimator.strikes_h[i] = most;
+        ecu.controller.estimator.hydraulics[i].strikes = most;
         expect_fault(FAULT_MODEL_MISMATCH);
-        TEST_ASSERT_EQUAL_UINT8(0, ecu.controller.estimator.strikes_h[i]);
+        TEST_ASSERT_EQUAL_UINT8(0, ecu.controller.estimator.hydraulics[i].strikes);
         expect_gone_after_a_second(FAULT_MODEL_MISMATCH);
         expect_none(100);
     }
