@@ -324,7 +324,7 @@ class _Plots:
             y_axis_label=unit,
         )
         plot.toolbar.logo = None
-        plot.min_border_left = 78  # the axes of all figures begin at the same place
+        plot.min_border_left = 118  # the axes of all figures begin at the same place
         plot.outline_line_color = None
         plot.grid.grid_line_color = "#E2E2E2"
         for axis in plot.axis:
@@ -382,7 +382,9 @@ def _draw_motion(plots: _Plots) -> None:
         plots.line(plot, contents.series("TRACKING", name), "reference", REFERENCE_COLOUR, line_width=5.0)
     for joint, name in enumerate(JOINT_NAMES):
         series = contents.series("ENCODERS", ("SwingAngle", "WristAngle")[joint])
-        plots.line(plot, series, name, JOINT_COLOURS[joint])
+        # the second is dashed: both joints may do the same
+        dash = ("solid", (6, 4))[joint]
+        plots.line(plot, series, name, JOINT_COLOURS[joint], line_dash=dash, line_width=(2.2, 1.8)[joint])
     plot = plots.add("Tracking errors", "error, mrad", "As the ECU reports them, one joint every 10 ms.")
     for joint, name in enumerate(JOINT_NAMES):
         series = contents.series("TRACKING", ("SwingError", "WristError")[joint], 1e3)
@@ -429,11 +431,9 @@ def _draw_states(plots: _Plots) -> None:
     contents = plots.contents
     names = names_of("VALVES", "Mode")
     order = sorted(names)
-    mode = contents.series("VALVES", "Mode")
+    mode = changes(contents.series("VALVES", "Mode"))
     place = {value: n for n, value in enumerate(order)}
-    mode = Series(mode.time_s, np.array([place.get(int(v), -1) for v in changes(mode).value])) if mode.is_empty else (
-        Series(changes(mode).time_s, np.array([place.get(int(v), -1) for v in changes(mode).value]))
-    )  # fmt: skip
+    mode = Series(mode.time_s, np.array([place.get(int(value), -1) for value in mode.value]))
     plot = plots.add("Modes", "", "Dotted: starts of the ECU.", height=210)
     plots.steps(plot, mode, "mode", MODE_COLOUR)
     plot.yaxis.ticker = list(range(len(order)))
@@ -475,12 +475,16 @@ def _draw_bus(plots: _Plots) -> None:
     if len(row) > 1:
         interval = Series(contents.time_of(row[1:]), np.diff(contents.recording.time_s[row]) * 1e3)
         plots.line(plot, interval, "interval", MODE_COLOUR)
+        # while the ECU waits for its sensors a tick is long: such ticks would flatten the others
+        most = max(2e3 * contents.period_s, 1.5 * float(np.quantile(interval.value, 0.995)))
+        plot.y_range.start, plot.y_range.end = 0.0, most
     plot = plots.add("Lost and refused", "count", "Counted by the ECU since its start; and SYNCs the recording lacks.")
     for name, colour in zip(("LostFrames", "E2eErrors", "LateTicks", "SendDrops"), COUNTER_COLOURS, strict=False):
         plots.steps(plot, contents.series("TIMING", name), name, colour)
     missing = Series(contents.time_of(row), np.cumsum(contents.ticks.missing).astype(float))
     plots.steps(plot, missing, "SYNC missing", COUNTER_COLOURS[-1])
-    plot.y_range.start = -0.5
+    told = [float(r.data_source.data["y"].max()) for r in plot.renderers]
+    plot.y_range.start, plot.y_range.end = -0.1, 1.1 * max([1.0, *told])
 
 
 # ---- the page ------------------------------------------------------------------------------------

@@ -266,7 +266,7 @@ def _lives(rows: np.ndarray, ticks: Ticks) -> list[_Life]:
             lives[-1].boots.append(boot)
         else:
             lives.append(_Life(boot, 0, [boot], 0))
-    ends = [life.first for life in lives[1:]] + [len(rows)]
+    ends = [life.first for life in lives[1:]] + [len(rows)] if lives else []
     for life, end in zip(lives, ends, strict=True):
         inside = gaps[(gaps > life.first) & (gaps < end)]
         life.end = int(inside[0]) if inside.size else end
