@@ -95,6 +95,15 @@ class Contents:
         series = self.series(message, name)
         return None if series.is_empty else float(series.value[-1])
 
+    def total(self, name: str) -> int | None:
+        """A counter of TIMING, which begins anew with every start of the ECU, over all of them."""
+        series = self.series("TIMING", name)
+        if series.is_empty:
+            return None
+        ends = np.searchsorted(series.time_s, start_times(self)[1:]) - 1
+        ends = np.append(ends[ends >= 0], len(series.value) - 1)
+        return int(series.value[np.unique(ends)].sum())
+
 
 def contents_of(recording: Recording) -> Contents:
     """Find a recording's ticks.
@@ -207,10 +216,9 @@ def summary_rows(contents: Contents) -> list[tuple[str, str]]:
         text = f"mean {timing.value.mean():.0f} µs, largest {timing.value.max():.0f} µs of those told"
         rows.append(("time of a tick", text))
     counters = ("LostFrames", "E2eErrors", "LateTicks", "SendDrops", "RefusedRequests")
-    said = [(name, contents.last("TIMING", name)) for name in counters]
-    rows.append(("counted by the ECU", ", ".join(f"{name} {value:.0f}" for name, value in said if value is not None)))
-    refused = contents.last("TIMING", "RefusedRequests")
-    if refused:
+    said = [(name, contents.total(name)) for name in counters]
+    rows.append(("counted by the ECU", ", ".join(f"{name} {value}" for name, value in said if value is not None)))
+    if contents.total("RefusedRequests"):
         reason = names_of("TIMING", "LastRefusal").get(int(contents.last("TIMING", "LastRefusal") or 0), "?")
         rows.append(("last refusal", reason))
     known = [message.frame_id for message in protocol.database().messages]
@@ -324,7 +332,7 @@ class _Plots:
             y_axis_label=unit,
         )
         plot.toolbar.logo = None
-        plot.min_border_left = 118  # the axes of all figures begin at the same place
+        plot.min_border_left = 186  # the axes of all figures begin at the same place
         plot.outline_line_color = None
         plot.grid.grid_line_color = "#E2E2E2"
         for axis in plot.axis:
@@ -455,7 +463,7 @@ def _draw_states(plots: _Plots) -> None:
                 spans.setdefault(code, []).append((since.pop(code), time_s))
     if not spans:
         return
-    plot = plots.add("Faults", "", "From becoming active to being cleared.", height=110 + 26 * len(spans))
+    plot = plots.add("Faults", "", "From becoming active to being cleared.", height=150 + 26 * len(spans))
     for n, (code, stretches) in enumerate(sorted(spans.items())):
         left, right = zip(*stretches, strict=True)
         plot.hbar(y=[n] * len(left), left=left, right=right, height=0.55, color=FAULT_COLOUR, line_width=2)
@@ -506,7 +514,7 @@ def parameter_rows(contents: Contents) -> list[Sequence[str]]:
         stem = described.name.removeprefix("theta_")
         value, sd = contents.last("PARAMETERS", described.name), contents.last("PARAMETERS", f"sd_{stem}")
         if value is not None and sd is not None:
-            relative = f"{100.0 * sd / abs(value):.2g} %" if value else "-"
+            relative = f"{100.0 * sd / abs(value):.2g} %" if sd < abs(value) else "over 100 %"
             rows.append((stem, f"{value:.6g}", f"{sd:.3g}", relative, described.unit or ""))
     return rows
 
