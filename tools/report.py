@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import nullcontext
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +52,9 @@ def main(argv: list[str]) -> int:
     console = Console(stderr=True)
     try:
         check_writable(output)
-        with console.status("reading") if console.is_terminal else console:
+        if find_spec("bokeh") is None:
+            raise ConfigError("the traces need bokeh: .venv/bin/python -m pip install -r requirements.txt")
+        with console.status("reading") if console.is_terminal else nullcontext():
             recording = part_of(read_recording(source), arguments.from_s, arguments.to_s)
             contents = contents_of(recording)
             notes = []
