@@ -67,8 +67,8 @@ class Recorder:
         check_free(path, force)
         if self.spool.exists() and not force:
             raise RecorderError(
-                f"{self.spool}: is left of a recorder that was killed; keep it: python tools/record.py --recover "
-                f"{path}; throw it away: --force"
+                f"{self.spool}: is left of a recorder that was killed, if none is running; keep it: python "
+                f"tools/record.py --recover {path}; throw it away: --force"
             )
         self.is_direct = self.kind in TEXT_FORMATS
         self.target = path if self.is_direct else self.spool

@@ -39,6 +39,7 @@ SDO_ANSWER_ID = 0x580 + ECU_NODE
 NMT_RESETS = (129, 130)
 RESET_TICKS = 3  # an NMT reset is carried out at most so many ticks before the boot-up
 DEFAULT_PERIOD_US = 1000
+SECOND_ECU_TICKS = 100  # a counter that jumps so far, or back, may be another one's
 MODE_SAFE_STOP = 6
 # What the ECU sends of a clock's; a replay has none.
 WALL_CLOCK_SIGNALS = {"TIMING": ("TickTime", "TickTimeCount")}
@@ -575,8 +576,9 @@ def replay(
         result.notes.append(f"{skipped} ticks before the first start of the ECU are left out")
     whole = sum(life.ticks for life in lives)
     done = 0
-    period = period_us(recording)
     for life in lives:
+        part = slice(life.first, life.end)
+        period = period_us(Recording(recording.path, recording.time_s[part], recording.rows[part]))
         ecu = InprocEcu(image, period, scalar)
         player = _Player(life, ecu)
         sections = _sections(life, recording, len(result.sections))
@@ -586,10 +588,8 @@ def replay(
         result.notes += player.trial.notes
         done += life.ticks
         if life.gap and not result.unusable:
-            result.unusable = (
-                f"{life.gap} ticks are missing after {_time(recording, life.end - 1)}: the recorder lost frames; "
-                "only what is before counts"
-            )
+            why = "the recorder lost frames" if life.gap < SECOND_ECU_TICKS else "or a second ECU was on the bus"
+            result.unusable = f"{life.gap} ticks are missing after {_time(recording, life.end - 1)}: {why}; only what is before counts"
     lost = _lost_by_recorder(recording, result, lives)
     if lost:
         result.unusable = lost

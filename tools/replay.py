@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -114,6 +115,15 @@ def report(recording: Recording, result: Replay, scalar: str) -> str:
     return "\n".join(lines)
 
 
+def other_number_type(recording: Recording, image: bytes | None, scalar: str) -> str:
+    """Whether the ECU recorded had another number type than the one replayed."""
+    for other in SCALARS:
+        with suppress(ConfigError):
+            if other != scalar and replay(recording, image, other).is_identical:
+                return f"; identical with --scalar {other}"
+    return ""
+
+
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
@@ -147,7 +157,7 @@ def main(argv: list[str]) -> int:
         say(f"replay.py: up to there: {'identical' if result.is_identical else 'different'}")
         return EXIT_UNUSABLE
     if not result.is_identical:
-        say("replay.py: different")
+        say("replay.py: different" + other_number_type(recording, image, arguments.scalar))
         return EXIT_DIFFERENT
     if not arguments.quiet:
         show("identical")

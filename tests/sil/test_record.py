@@ -283,6 +283,8 @@ def test_other_frames_than_the_ecus_are_kept(tmp_path: Path) -> None:
         recorder.add(message)
     recorder.close()
     with can.MF4Reader(path) as reader:
+        assert next(iter(reader)).timestamp == pytest.approx(1e9, abs=1e-3)
+    with can.MF4Reader(path) as reader:
         ours = sorted((str(m.arbitration_id), m.is_extended_id, m.is_fd, m.is_remote_frame, m.is_error_frame, m.is_rx,
                        m.dlc, bytes(m.data)) for m in reader)  # fmt: skip
     expected = sorted((str(m.arbitration_id), m.is_extended_id, m.is_fd, m.is_remote_frame, m.is_error_frame, m.is_rx,

@@ -324,6 +324,20 @@ def test_missing_ticks_do_not_look_like_another_law(messages: Messages, image: b
     assert result.sections[0].ends_at_gap == 3 and result.counts["VALVES"].compared == 300
 
 
+def test_a_second_ecu_is_not_called_lost_frames(messages: Messages, image: bytes) -> None:
+    """GIVEN a SYNC that comes twice WHEN replayed THEN a second ECU is thought of."""
+    place = places(messages, "SYNC")[300]
+    result = replay(recording_of([*messages[:place], messages[place], *messages[place:]]), image)
+    assert "second ECU" in result.unusable
+
+
+def test_another_period_is_replayed(machine: Machine, image: bytes, paper: Scenario) -> None:
+    """GIVEN an ECU at 2 ms WHEN its recording is replayed THEN with 2 ms, as it says itself."""
+    short = session.make_session(machine, replace(paper, duration_s=0.3), "diarc", 1, 2e-3)
+    result = replay(recording_of(capture(short, InprocEcu(image, 2000))), image)
+    assert result.is_identical, result.first
+
+
 def test_missing_sensor_frames_do_not_look_like_another_law(messages: Messages, image: bytes) -> None:
     """GIVEN sensor frames that the ECU had and the recorder has not WHEN replayed THEN the recorder is blamed."""
     lost = set(places(messages, "ENCODERS")[150:160])
@@ -433,6 +447,8 @@ def test_exit_status_and_texts(
     params.write_bytes(image)
     same = run(log, "--params", params)
     assert same.returncode == 0 and same.stdout.endswith("identical\n"), same.stderr
+    fixed = run(log, "--params", params, "--scalar", "fixed")
+    assert fixed.returncode == 1 and "identical with --scalar double" in fixed.stderr
     place = places(messages, "VALVES")[321]
 
     def flip(row: np.ndarray) -> None:
