@@ -589,7 +589,8 @@ def replay(
         done += life.ticks
         if life.gap and not result.unusable:
             why = "the recorder lost frames" if life.gap < SECOND_ECU_TICKS else "or a second ECU was on the bus"
-            result.unusable = f"{life.gap} ticks are missing after {_time(recording, life.end - 1)}: {why}; only what is before counts"
+            place = _time(recording, life.end - 1)
+            result.unusable = f"{life.gap} ticks are missing after {place}: {why}; only what is before counts"
     lost = _lost_by_recorder(recording, result, lives)
     if lost:
         result.unusable = lost
