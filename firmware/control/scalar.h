@@ -76,4 +76,7 @@ gain gain_from_real32(uint32_t bits, int8_t exponent);
 bool scalar_holds_real32(uint32_t bits, int8_t exponent);
 bool gain_holds_real32(uint32_t bits, int8_t exponent);
 
+/* The binary32 bits of x * 2^exponent, to the nearest, halves to even; |exponent| <= 96. */
+uint32_t real32_from_scalar(scalar x, int8_t exponent);
+
 #endif

@@ -217,4 +217,22 @@ gain gain_from_real32(uint32_t bits, int8_t exponent)
     return from_real32(bits, exponent, GAIN_FRACTION);
 }
 
+uint32_t real32_from_scalar(scalar x, int8_t exponent)
+{
+    uint32_t magnitude = magnitude_of(x);
+    if (magnitude == 0u) {
+        return 0;
+    }
+    const uint32_t sign = x < 0 ? 0x80000000u : 0u;
+    const uint8_t zeros = leading_zeros(magnitude);
+    /* normalised, 32 bits: 24 of them stay */
+    magnitude <<= zeros;
+    const uint32_t rest = magnitude & 0xFFu;
+    uint32_t mantissa = magnitude >> 8;
+    mantissa += rest > 0x80u || (rest == 0x80u && (mantissa & 1u) != 0u) ? 1u : 0u;
+    /* value = mantissa * 2^(8 - zeros - fraction + exponent); the mantissa's first bit adds one to the field */
+    const int16_t field = (int16_t)(exponent - SCALAR_FRACTION + 8 - zeros + 149);
+    return sign | (((uint32_t)field << 23) + mantissa);
+}
+
 #endif

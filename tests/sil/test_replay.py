@@ -92,7 +92,10 @@ def test_a_changed_law_is_noticed() -> None:
     """GIVEN the committed recording, in fixed point WHEN replayed
     THEN not one bit differs, over the ticks, frames and the restart that it is known to have.
     """
-    result = replay(read_recording(REFERENCE), None, "fixed")
+    try:
+        result = replay(read_recording(REFERENCE), None, "fixed")
+    except RecordingError as error:
+        pytest.fail(f"{error}; if the frames were meant to change, make the recording anew: {UPDATE}")
     assert result.is_identical and not result.unusable, (
         f"the ECU says something else than it did: {result.first}. If that is meant, make the recording anew: {UPDATE}"
     )
