@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import importlib.util
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,8 +20,9 @@ from sil_plant import protocol, session
 from sil_plant.capture import capture
 from sil_plant.frames import DATA, from_row, protect, to_row
 from sil_plant.inproc import InprocEcu
-from sil_plant.machine import Machine, parameter_image
+from sil_plant.machine import Machine, load_parameter_table, parameter_image
 from sil_plant.recording import (
+    ECU_NODE,
     FORMATS,
     Recording,
     RecordingError,
@@ -30,7 +32,7 @@ from sil_plant.recording import (
     rows_of,
     signal,
 )
-from sil_plant.replay import replay
+from sil_plant.replay import SDO_ANSWER_ID, replay
 from sil_plant.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -288,6 +290,37 @@ def test_parameters_and_tare_do_not_leak_over_a_reset(record_run: Callable[..., 
     result = replay(recording_of(record_run(disturb)), image)
     assert result.is_identical, result.first
     assert [(s.ticks, s.by_reset) for s in result.sections] == [(201, False), (TICKS - 201, True)]
+
+
+def test_what_sdo_changed_counts(record_run: Callable[..., Messages], image: bytes, machine: Machine) -> None:
+    """GIVEN a gain written by SDO before RUN, read again after NMT reset, and the tick time read WHEN replayed
+    THEN identical, also where a clock's figure was another; without the write it differs.
+    """
+    gain = "control.swing.k1_1_s"
+    number = 0x2100 + [entry.name for entry in load_parameter_table().entries].index(gain)
+    request = 0x600 + ECU_NODE
+
+    def disturb(tick: int, heard: np.ndarray) -> np.ndarray:
+        data = {
+            40: struct.pack("<BHBf", 0x23, number, 0, 1.2 * machine[gain]),
+            100: struct.pack("<BHB4x", 0x40, 0x2009, 0),
+            300: struct.pack("<BHB4x", 0x40, number, 0),
+        }.get(tick)
+        extra = [to_row(request, data)] if data else []
+        extra += [session.nmt_frame(session.NMT_RESET)] if tick == 200 else []
+        return np.concatenate((np.array(extra, dtype=np.uint8), heard)) if extra else heard
+
+    log = record_run(disturb)
+    answers = [k for k, m in enumerate(log) if m.arbitration_id == SDO_ANSWER_ID]
+    assert [log[k].data[0] & 0xE0 for k in answers] == [0x60, 0x40, 0x40]  # no abort
+    assert struct.unpack("<f", bytes(log[answers[2]].data[4:]))[0] == pytest.approx(1.2 * machine[gain])
+    log[answers[1]].data[4] ^= 0xFF  # a tick time
+    result = replay(recording_of(log), image)
+    assert result.is_identical, result.first
+    assert result.counts["SDO answer"].compared == 3
+    write = next(k for k, m in enumerate(log) if m.arbitration_id == request)
+    other = replay(recording_of([*log[:write], *log[write + 1 :]]), image)
+    assert other.counts["VALVES"].different > 0 and other.counts["SDO answer"].wrong > 0
 
 
 def test_a_recording_without_start_says_what_it_needs(messages: Messages, image: bytes) -> None:
