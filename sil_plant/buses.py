@@ -61,6 +61,7 @@ _CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _ARPHRD_CAN, _IFF_UP = 280, 1
 _SIOCGIFFLAGS, _SIOCGIFHWADDR = 0x8913, 0x8927
 _SO_MEMINFO, _MEMINFO_DROPS = 55, 8
+_SO_RCVBUFFORCE = 33
 _AF_CAN = getattr(socket, "AF_CAN", None)
 _SEND_LIMIT_S = 0.1  # how long to wait for room in a full transmit queue
 _SEND_PAUSE_S = 0.0002  # between attempts: about two frames at 1 Mbit/s
@@ -419,8 +420,11 @@ class SocketCanPort(FramePort):
 
 
 def _enlarge_buffer(sock: socket.socket) -> None:
-    with contextlib.suppress(OSError):  # the default holds some 270 frames; the kernel grants what it may
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+    """Ask for room for 2 s of frames; the default has it for 50 ms, and without rights the kernel grants 100 ms."""
+    for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.SOL_SOCKET, option, 4 << 20)
+            return
 
 
 def _kernel_drops(sock: socket.socket) -> int:
