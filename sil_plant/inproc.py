@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
+import numba.experimental.function_type  # noqa: F401  without it numba does not know _CFunction before its first compiling
 import numpy as np
 from numba import njit, types
 from numba.types import WrapperAddressProtocol
@@ -102,6 +103,16 @@ class InprocEcu:
         sent = self.library.diarc_inproc_end(self.pointer, rx.ctypes.data, len(rx), tx.ctypes.data, TX_ROWS)
         return tx[:sent]
 
+    def request_safe_stop(self) -> None:
+        """What its port does, between ticks, when it is told to end."""
+        self.library.diarc_inproc_request_safe_stop(self.pointer)
+
+    def shutdown(self) -> np.ndarray:
+        """Shut the valves at once; the frames sent."""
+        tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
+        sent = self.library.diarc_inproc_shutdown(self.pointer, tx.ctypes.data, TX_ROWS)
+        return tx[:sent]
+
 
 def _load(path: Path) -> ctypes.CDLL:
     try:
@@ -128,6 +139,9 @@ def _load(path: Path) -> ctypes.CDLL:
         ctypes.c_void_p,
         ctypes.c_int32,
     )
+    library.diarc_inproc_request_safe_stop.argtypes = (ctypes.c_void_p,)
+    library.diarc_inproc_request_safe_stop.restype = None
+    library.diarc_inproc_shutdown.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int32)
     return library
 
 
