@@ -1680,6 +1680,14 @@ int diarc_timing_pack(
         dst_p[7] |= pack_right_shift_u16(src_p->period_us, 8u, 0xffu);
         break;
 
+    case 4:
+        dst_p[3] |= pack_left_shift_u8(src_p->tick_time_bucket, 0u, 0xffu);
+        dst_p[4] |= pack_left_shift_u32(src_p->tick_time_count, 0u, 0xffu);
+        dst_p[5] |= pack_right_shift_u32(src_p->tick_time_count, 8u, 0xffu);
+        dst_p[6] |= pack_right_shift_u32(src_p->tick_time_count, 16u, 0xffu);
+        dst_p[7] |= pack_right_shift_u32(src_p->tick_time_count, 24u, 0xffu);
+        break;
+
     default:
         break;
     }
@@ -1730,12 +1738,12 @@ bool diarc_timing_mode_is_in_phys_range(double value)
 
 bool diarc_timing_timing_page_is_in_range(uint8_t value)
 {
-    return (value <= 3u);
+    return (value <= 4u);
 }
 
 bool diarc_timing_timing_page_is_in_phys_range(double value)
 {
-    return ((value >= 0.0) && (value <= 3.0));
+    return ((value >= 0.0) && (value <= 4.0));
 }
 
 bool diarc_timing_tick_time_is_in_range(uint16_t value)
@@ -1784,6 +1792,28 @@ bool diarc_timing_refused_requests_is_in_range(uint16_t value)
 bool diarc_timing_refused_requests_is_in_phys_range(double value)
 {
     return ((value >= 0.0) && (value <= 65535.0));
+}
+
+bool diarc_timing_tick_time_bucket_is_in_range(uint8_t value)
+{
+    return (value <= 11u);
+}
+
+bool diarc_timing_tick_time_bucket_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 11.0));
+}
+
+bool diarc_timing_tick_time_count_is_in_range(uint32_t value)
+{
+    (void)value;
+
+    return (true);
+}
+
+bool diarc_timing_tick_time_count_is_in_phys_range(double value)
+{
+    return ((value >= 0.0) && (value <= 4294967295.0));
 }
 
 bool diarc_timing_late_ticks_is_in_range(uint16_t value)

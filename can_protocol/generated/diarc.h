@@ -377,6 +377,8 @@ extern "C" {
 #define DIARC_TIMING_DBC_HASH_NAME "DbcHash"
 #define DIARC_TIMING_LOST_FRAMES_NAME "LostFrames"
 #define DIARC_TIMING_REFUSED_REQUESTS_NAME "RefusedRequests"
+#define DIARC_TIMING_TICK_TIME_BUCKET_NAME "TickTimeBucket"
+#define DIARC_TIMING_TICK_TIME_COUNT_NAME "TickTimeCount"
 #define DIARC_TIMING_LATE_TICKS_NAME "LateTicks"
 #define DIARC_TIMING_E2E_ERRORS_NAME "E2eErrors"
 #define DIARC_TIMING_LAST_REFUSAL_NAME "LastRefusal"
@@ -1182,7 +1184,9 @@ struct diarc_timing_t {
     uint8_t mode;
 
     /**
-     * Range: 0..3 (0..3 -)
+     * Pages 0 to 4 in turn, one a frame; page 4 has the buckets 0 to 11 in turn
+     *
+     * Range: 0..4 (0..4 -)
      * Scale: 1
      * Offset: 0
      */
@@ -1223,6 +1227,24 @@ struct diarc_timing_t {
      * Offset: 0
      */
     uint16_t refused_requests;
+
+    /**
+     * Bucket of the histogram of TickTime: 0 is below 1 us, n is 2^(n-1) us to below 2^n us, 11 is 1024 us and more
+     *
+     * Range: 0..11 (0..11 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint8_t tick_time_bucket;
+
+    /**
+     * Ticks in this bucket since the restart
+     *
+     * Range: 0..4294967295 (0..4294967295 -)
+     * Scale: 1
+     * Offset: 0
+     */
+    uint32_t tick_time_count;
 
     /**
      * Ticks whose sensor frames had not all come at the deadline
@@ -3764,6 +3786,50 @@ bool diarc_timing_refused_requests_is_in_range(uint16_t value);
  * @return true if in range, false otherwise.
  */
 bool diarc_timing_refused_requests_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_timing_tick_time_bucket_is_in_range(uint8_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_timing_tick_time_bucket_is_in_phys_range(double value);
+
+/**
+ * Check that given signal is in allowed range.
+ *
+ * @param[in] value Signal to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_timing_tick_time_count_is_in_range(uint32_t value);
+
+/**
+ * Check that given physical value is in allowed range before encoding.
+ *
+ * Use this BEFORE calling _encode() to avoid silent integer overflow:
+ *   encode(-1.0) on a [0,100] signal wraps to 255 and passes is_in_range().
+ *   is_in_phys_range(-1.0) correctly returns false.
+ *
+ * @param[in] value Physical signal value to check.
+ *
+ * @return true if in range, false otherwise.
+ */
+bool diarc_timing_tick_time_count_is_in_phys_range(double value);
 
 /**
  * Check that given signal is in allowed range.

@@ -15,7 +15,7 @@ struct safe_stop safe_stop_start(const struct controller *controller, const stru
                                  const struct controller_constants *constants,
                                  const struct measurement *last_good, uint16_t ticks)
 {
-    struct safe_stop stop = {.ticks = ticks};
+    struct safe_stop stop = {.ticks = ticks, .at = *last_good};
     for (uint8_t i = 0; i < JOINTS; i++) {
         const struct joint_output *const out = &controller->output[i];
         stop.w[i] = out->reference.w;
@@ -25,8 +25,7 @@ struct safe_stop safe_stop_start(const struct controller *controller, const stru
 }
 
 bool safe_stop_step(struct safe_stop *stop, const struct machine *machine,
-                    const struct controller_constants *constants, const struct measurement *last_good,
-                    scalar u[JOINTS])
+                    const struct controller_constants *constants, scalar u[JOINTS])
 {
     if (stop->tick < stop->ticks) {
         stop->tick++;
@@ -35,7 +34,7 @@ bool safe_stop_step(struct safe_stop *stop, const struct machine *machine,
     const scalar share = smooth_step_down(fraction(stop->tick, stop->ticks));
     for (uint8_t i = 0; i < JOINTS; i++) {
         const scalar spool =
-            model_spool(machine, constants, last_good, (enum joint)i, mul(share, stop->w[i])) +
+            model_spool(machine, constants, &stop->at, (enum joint)i, mul(share, stop->w[i])) +
             mul(share, stop->extra[i]);
         u[i] = over ? SCALAR(0) : limit(spool, SCALAR(-1), SCALAR(1));
     }

@@ -8,9 +8,9 @@ static struct mode_conditions conditions_of(const struct ecu *ecu)
 {
     return (struct mode_conditions){
         .operational = ecu->nmt == NMT_OPERATIONAL,
-        .sensors_good = ecu->supervision.sensors_wrong == 0u,
+        .sensors_good = ecu->sampled && ecu->supervision.sensors_wrong == 0u,
         .fault_active = fault_stops(ecu),
-        .cause_gone = supervision_cause_gone(ecu),
+        .cause_gone = !parameter_set_coming(ecu) && supervision_cause_gone(ecu),
     };
 }
 
@@ -96,9 +96,8 @@ void operation_step(struct ecu *ecu)
     if (ecu->mode != MODE_SAFE_STOP) {
         return;
     }
-    const struct measurement measured = samples_measured(ecu, &ecu->samples);
     scalar u[JOINTS];
-    const bool over = safe_stop_step(&ecu->stop, &ecu->machine, &ecu->constants, &measured, u);
+    const bool over = safe_stop_step(&ecu->stop, &ecu->machine, &ecu->constants, u);
     for (uint8_t i = 0; i < JOINTS; i++) {
         ecu->controller.output[i].u = u[i];
     }

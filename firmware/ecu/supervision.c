@@ -11,6 +11,8 @@
 #define DUPLICATE_TICKS 100u
 #define HEARTBEAT_BASE 0x700u
 #define ID_MASK 0x7Fu
+#define US_PER_MS 1000u
+#define CONSUMER_US_LAST (UINT32_C(1) << 31)
 
 static void count_u8(uint8_t *counter)
 {
@@ -79,6 +81,8 @@ void supervision_arm(struct ecu *ecu, const struct measurement *measured)
         s->stuck_for[i][ANNULUS] = 0;
     }
     s->reopened = ecu->controller.estimator.reopened;
+    s->late_starts = 0;
+    s->window = 0;
 }
 
 void supervise_sensors(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault wrong)
@@ -191,12 +195,12 @@ static void watch_estimate(struct ecu *ecu, const struct ecu_port *port)
     struct supervision *const s = &ecu->supervision;
     struct estimator *const estimator = &ecu->controller.estimator;
     const struct prior *const load = &ecu->machine.estimator.m[M_T];
-    const bool mismatch = estimator->strikes_h[SWING] >= s->mismatch_limit ||
-                          estimator->strikes_h[WRIST] >= s->mismatch_limit ||
+    const bool mismatch = estimator->hydraulics[SWING].strikes >= s->mismatch_limit ||
+                          estimator->hydraulics[WRIST].strikes >= s->mismatch_limit ||
                           (uint16_t)(estimator->reopened - s->reopened) >= REOPENED_MOST;
     if (mismatch) {
-        estimator->strikes_h[SWING] = 0;
-        estimator->strikes_h[WRIST] = 0;
+        estimator->hydraulics[SWING].strikes = 0;
+        estimator->hydraulics[WRIST].strikes = 0;
         s->reopened = estimator->reopened;
     }
     degrade(ecu, port, FAULT_MODEL_MISMATCH, CLEARING_MISMATCH, mismatch);
@@ -237,14 +241,16 @@ static void watch_arm(struct ecu *ecu, const struct ecu_port *port, const struct
 static bool consumer_silent(const struct ecu *ecu)
 {
     const uint32_t time_ms = ecu->heartbeat_consumer & 0xFFFFu;
-    const uint32_t silent_us = ecu->supervision.consumer_ticks * ecu->period_us;
-    return ecu->supervision.consumer_heard && time_ms > 0u && silent_us / 1000u > time_ms;
+    const struct supervision *const s = &ecu->supervision;
+    return s->consumer_heard && time_ms > 0u && s->consumer_us > time_ms * US_PER_MS;
 }
 
-static void watch_bus(struct ecu *ecu, const struct ecu_port *port)
+void supervise_bus(struct ecu *ecu, const struct ecu_port *port)
 {
     struct supervision *const s = &ecu->supervision;
-    count_u16(&s->consumer_ticks);
+    if (s->consumer_us < CONSUMER_US_LAST) {
+        s->consumer_us += ecu->period_us;
+    }
     if (consumer_silent(ecu) && ecu->controller.armed) {
         fault_raise(ecu, port, FAULT_HEARTBEAT_LOST);
     }
@@ -274,8 +280,12 @@ void supervise_machine(struct ecu *ecu, const struct ecu_port *port, const struc
 {
     if (ecu->controller.armed) {
         watch_arm(ecu, port, before, measured);
+    } else {
+        /* nobody looks any more: what degrades leaves a second later all the same */
+        degrade(ecu, port, FAULT_MODEL_MISMATCH, CLEARING_MISMATCH, false);
+        degrade(ecu, port, FAULT_CAVITATION, CLEARING_CAVITATION, false);
+        degrade(ecu, port, FAULT_ESTIMATE_AT_BOUND, CLEARING_BOUND, false);
     }
-    watch_bus(ecu, port);
 }
 
 void supervise_frame(struct ecu *ecu, const struct can_frame_11bit *frame)
@@ -284,7 +294,7 @@ void supervise_frame(struct ecu *ecu, const struct can_frame_11bit *frame)
     const uint32_t consumed = (ecu->heartbeat_consumer >> 16) & ID_MASK;
     if (consumed != 0u && frame->id == HEARTBEAT_BASE + consumed) {
         s->consumer_heard = true;
-        s->consumer_ticks = 0;
+        s->consumer_us = 0;
     }
     if (frame->id == DIARC_SYNC_FRAME_ID || frame->id == DIARC_VALVES_FRAME_ID ||
         frame->id == DIARC_ESTIMATE_FRAME_ID || frame->id == DIARC_HEARTBEAT_ECU_FRAME_ID) {

@@ -40,7 +40,7 @@ struct supervision {
     uint16_t late_starts;                 /* in the window */
     uint8_t send_failures;                /* valve frames in a row the bus did not take; stops at 255 */
     uint8_t duplicate_ticks;              /* until a frame of a second ECU is forgotten */
-    uint16_t consumer_ticks;              /* since the consumed heartbeat was heard; stops at 65535 */
+    uint32_t consumer_us;                 /* since the consumed heartbeat was heard; stops at 2^31 */
     bool consumer_heard;
 };
 
@@ -53,9 +53,12 @@ void supervision_arm(struct ecu *ecu, const struct measurement *measured);
 /* This tick's samples, as samples_take judged them: modes that follow, and the faults of sensors. */
 void supervise_sensors(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault wrong);
 
-/* After the law: the machine's limits, and the bus. before: the samples of the tick before. */
+/* After the law: the machine's limits. before: the samples of the tick before. */
 void supervise_machine(struct ecu *ecu, const struct ecu_port *port, const struct sensor_samples *before,
                        const struct measurement *measured);
+
+/* Once a tick, with or without samples: the bus. */
+void supervise_bus(struct ecu *ecu, const struct ecu_port *port);
 
 /* A frame came that is none of the receive table: a heartbeat, or one that only this ECU sends. */
 void supervise_frame(struct ecu *ecu, const struct can_frame_11bit *frame);

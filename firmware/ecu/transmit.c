@@ -5,20 +5,22 @@
 #include "ecu/e2e.h"
 #include "ecu/wire.h"
 
-enum tx_counter { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING };
-
 #define VALVE_DISABLED DIARC_VALVES_SWING_CONTROL_DISABLED_CHOICE
 #define VALVE_ACTIVE DIARC_VALVES_SWING_CONTROL_ACTIVE_CHOICE
 
 #define THETA_FRAMES (THETA_M + THETA_H)
-#define TIMING_PAGES 4
+#define TIMING_PAGES 5
+#define PAGE_TICK_TIMES 4
 
-/* Protect a packed frame and advance its counter. */
-static void protect(struct ecu *ecu, enum tx_counter which, struct can_frame_11bit *frame)
+/* Protect a packed frame, advance its counter, and keep the data for who asks by SDO. */
+static void protect(struct ecu *ecu, enum sent_frame which, struct can_frame_11bit *frame)
 {
     uint8_t *const counter = &ecu->tx_counter[which];
     e2e_protect((uint16_t)frame->id, *counter, frame->data);
     *counter = (uint8_t)((*counter + 1u) % E2E_COUNTER_STATES);
+    for (uint8_t k = 0; k < 8u; k++) {
+        ecu->sent[which][k] = frame->data[k];
+    }
 }
 
 struct can_frame_11bit transmit_sync(uint8_t sync_counter)
@@ -95,7 +97,7 @@ struct can_frame_11bit transmit_estimate(struct ecu *ecu)
         .load_sd = (uint16_t)WIRE_ENCODE(sd, DIARC_ESTIMATE_LOAD_SD, base, 0, WIRE_MAX_U16),
         .updating = estimator->updating,
         .load_used = controller->armed && controller->kind == CONTROLLER_DIARC,
-        .load_at_bound = m_t <= load->low || m_t >= load->high,
+        .load_at_bound = !parameter_set_coming(ecu) && (m_t <= load->low || m_t >= load->high),
         .valve_saturated = out[SWING].saturated || out[WRIST].saturated,
         .moving = controller->armed && (trajectory_moving(&controller->trajectory[SWING]) ||
                                         trajectory_moving(&controller->trajectory[WRIST])),
@@ -204,6 +206,10 @@ struct can_frame_11bit transmit_timing(struct ecu *ecu)
     const uint8_t page = ecu->next_page;
     ecu->next_page = (uint8_t)((page + 1u) % TIMING_PAGES);
     const struct ecu_counters *const counters = &ecu->counters;
+    const uint8_t bucket = ecu->next_bucket;
+    if (page == PAGE_TICK_TIMES) {
+        ecu->next_bucket = (uint8_t)((bucket + 1u) % TIME_BUCKETS);
+    }
     const struct diarc_timing_t message = {
         .mode = (uint8_t)ecu->mode,
         .timing_page = page,
@@ -217,6 +223,8 @@ struct can_frame_11bit transmit_timing(struct ecu *ecu)
         .refused_requests = counters->refused,
         .last_refusal = (uint8_t)counters->last_refusal,
         .period_us = (uint16_t)ecu->period_us,
+        .tick_time_bucket = bucket,
+        .tick_time_count = counters->tick_times.count[bucket],
     };
     struct can_frame_11bit frame = {.id = DIARC_TIMING_FRAME_ID, .length = DIARC_TIMING_LENGTH};
     (void)diarc_timing_pack(frame.data, &message, sizeof frame.data);

@@ -27,7 +27,13 @@ from tests.rules.compilers import (
 Configure = Callable[..., list[Unit]]
 
 FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wdouble-promotion", "-Werror")
-FOR_A_PC = ("firmware/control/*.c", "firmware/ecu/*.c", "firmware/ports/inproc/*.c", "firmware/ports/linux/*.c")
+FOR_A_PC = (
+    "firmware/control/*.c",
+    "firmware/ecu/*.c",
+    "firmware/ports/inproc/*.c",
+    "firmware/ports/linux/*.c",
+    "tools/latency/*.c",
+)
 FOR_A_BOARD = ("firmware/control/*.c", "firmware/ecu/*.c", "firmware/ports/cortex_m/**/*.c")
 GENERATED = "can_protocol/generated/*.c"
 PRESETS = [

@@ -184,6 +184,7 @@ static struct estimator_sample sample_at(uint32_t k)
     for (uint8_t i = 0; i < JOINTS; i++) {
         sample.dq[i] = from_real(now.q[i] - before.q[i]);
         sample.reference_w[i] = from_real(now.w[i]);
+        sample.friction_sign[i] = coulomb_sign(&machine.arm, sample.reference_w[i]);
         sample.cylinder[i] = cylinder_at(&machine.cylinder[i], &cylinders[i], from_real(now.q[i]));
         sample.lever[i] = SCALAR(1);
         sample.force[i] = per_unit(force_N(t, i), bases.pressure + bases.area);
@@ -250,7 +251,8 @@ static void test_rates_wrong_at_the_shortest_or_the_longest_period(void)
         const struct estimator_constants c = estimator_constants(parameters, dt_s);
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_tick) * real(dt_s));
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK * real(c.filter), real(c.filter),
-                                  real_gain(c.filter_rate) * real(dt_s));
+                                  real_gain(c.filter_rate) * ROW_TURNS * real(dt_s));
+        TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_window) * ROW_TURNS * real(dt_s));
     }
 }
 
@@ -483,6 +485,7 @@ static struct estimator_sample steady_turn(void)
     struct estimator_sample sample = sample_at(rest);
     sample.dq[SWING] = from_real(0.3 * DT_S);
     sample.reference_w[SWING] = SCALAR(0.3);
+    sample.friction_sign[SWING] = coulomb_sign(&machine.arm, SCALAR(0.3));
     sample.force[SWING] = per_unit(torque_Nm / lever_arm_m(rest, SWING), bases.pressure + bases.area);
     return sample;
 }
@@ -516,6 +519,7 @@ static void test_load_forgotten_at_another_rate(void)
     restart_estimator();
     run(0, MOVE_TICKS + REST_TICKS);
     const struct estimator_sample steady = steady_turn();
+    estimator_resume(&estimator);    /* no torque is behind the jump to 0.3 rad/s */
     for (int k = 0; k < 1000; k++) { /* the turn's beginning tells of the load */
         estimator_step(&estimator, parameters, &constants, &machine.arm, &steady);
     }
@@ -559,6 +563,145 @@ static void test_one_strange_sample_taken_for_a_new_load(void)
     TEST_ASSERT_DOUBLE_WITHIN(0.1, 5, load_kg());
 }
 
+static void test_doubtful_samples_taken_while_held(void)
+{
+    /* GIVEN an estimate held because the sensors are in doubt WHEN the arm moves and its forces are nonsense THEN not a
+     * bit of estimate or covariance moves, and it says so; let go, it finds the load as ever */
+    run(0, 700);
+    estimator.held = true;
+    const struct estimator before = estimator;
+    for (uint32_t k = 700; k < PERIOD_TICKS + 700; k++) {
+        struct estimator_sample sample = sample_at(k);
+        if (k < PERIOD_TICKS + 200) { /* the filters have forgotten it when let go */
+            sample.force[SWING] = -sample.force[SWING];
+            sample.flow[WRIST] = -sample.flow[WRIST];
+        }
+        estimator_step(&estimator, parameters, &constants, &machine.arm, &sample);
+        TEST_ASSERT_TRUE(k < 703 || !estimator.updating);
+    }
+    TEST_ASSERT_EQUAL_MEMORY(before.theta_m, estimator.theta_m, sizeof before.theta_m);
+    TEST_ASSERT_EQUAL_MEMORY(before.theta_h, estimator.theta_h, sizeof before.theta_h);
+    TEST_ASSERT_EQUAL_MEMORY(&before.covariance_m, &estimator.covariance_m, sizeof before.covariance_m);
+    TEST_ASSERT_EQUAL_MEMORY(&before.covariance_h, &estimator.covariance_h, sizeof before.covariance_h);
+    TEST_ASSERT_EQUAL_UINT16(0, estimator.reopened);
+    estimator.held = false;
+    run(PERIOD_TICKS + 700, 2 * PERIOD_TICKS);
+    TEST_ASSERT_TRUE(fabs(load_kg() - 5) < 0.01);
+}
+
+static void commission_friction(double load_in_truth_kg)
+{
+    plant.load_kg = load_in_truth_kg;
+    plant.viscous[SWING] = 18;
+    plant.coulomb[SWING] = 10;
+    plant.coulomb[WRIST] = 4;
+    plant.offset_Nm[SWING] = 3;
+    restart_estimator();
+    estimator_commission(&estimator);
+    for (uint32_t k = 0; k < 4 * PERIOD_TICKS; k++) {
+        step(k);
+        TEST_ASSERT_TRUE(estimator.theta_m[M_T] == SCALAR(0));
+    }
+}
+
+static double found(enum theta_m k)
+{
+    return si_of(estimator.theta_m[k], torque_base);
+}
+
+static void test_commissioning_finds_the_priors(void)
+{
+    /* GIVEN an arm without load whose friction is far from priors that are sure of themselves WHEN commissioned THEN its
+     * own friction is found, and the load is none all the way, with no deviation */
+    commission_friction(0);
+    TEST_ASSERT_DOUBLE_WITHIN(0.5, 18, found(FV1));
+    TEST_ASSERT_DOUBLE_WITHIN(0.3, 10, found(FC1));
+    TEST_ASSERT_DOUBLE_WITHIN(0.3, 4, found(FC2));
+    TEST_ASSERT_DOUBLE_WITHIN(0.3, 3, found(OM1));
+    TEST_ASSERT_TRUE(estimator_sd_m(&estimator, &constants, M_T) == SCALAR(0));
+}
+
+static void test_commissioning_takes_its_surprises_for_a_load(void)
+{
+    /* GIVEN an arm that carries 5 kg all the same WHEN commissioned THEN the innovation test does not open a load that
+     * there must not be, and nothing is lost in the filters; what had been opened before commissioning is forgotten */
+    commission_friction(5);
+    TEST_ASSERT_EQUAL_UINT16(0, estimator.reopened);
+    TEST_ASSERT_TRUE(estimator.mechanics[SWING].strikes == 0 && estimator.mechanics[WRIST].strikes == 0);
+    TEST_ASSERT_TRUE(estimator_sd_m(&estimator, &constants, M_T) == SCALAR(0));
+    TEST_ASSERT_TRUE(estimator.updating || estimator.samples == 2u * ROW_TURNS + 1u);
+}
+
+static void test_operation_forgets_what_commissioning_found(void)
+{
+    /* GIVEN an arm commissioned without load WHEN it is operated THEN all but the load are where they were found, as sure
+     * as the priors say, the load is its prior and open; and 5 kg are found */
+    commission_friction(0);
+    const struct estimator before = estimator;
+    estimator_operate(&estimator, parameters, &constants);
+    for (uint8_t k = 0; k < THETA_M; k++) {
+        const double sd = real(parameters->m[k].sd);
+        TEST_ASSERT_DOUBLE_WITHIN(20 * STEP + 1e-3 * sd, sd,
+                                  real(estimator_sd_m(&estimator, &constants, (enum theta_m)k)));
+        TEST_ASSERT_TRUE(k == M_T || estimator.theta_m[k] == before.theta_m[k]);
+    }
+    for (uint8_t k = 0; k < THETA_H; k++) {
+        const double sd = real(parameters->h[k].sd);
+        TEST_ASSERT_DOUBLE_WITHIN(20 * STEP + 1e-3 * sd, sd,
+                                  real(estimator_sd_h(&estimator, &constants, (enum theta_h)k)));
+        TEST_ASSERT_TRUE(estimator.theta_h[k] == before.theta_h[k]);
+    }
+    TEST_ASSERT_TRUE(estimator.theta_m[M_T] == parameters->m[M_T].value);
+    TEST_ASSERT_FALSE(estimator.commissioning);
+    plant.load_kg = 5;
+    run(0, PERIOD_TICKS);
+    TEST_ASSERT_DOUBLE_WITHIN(0.05, 5, load_kg());
+}
+
+static void test_sensors_that_contradict_each_other_not_noticed(void)
+{
+    /* GIVEN an arm that has moved for 4 s without one strike of the hydraulics in a row of three WHEN its wrist's spool
+     * says the opposite of what pressures and encoder do THEN the wrist's strikes count up, update by update, the swing's
+     * do not; they stop at 255, and are none again with the truth */
+    for (uint32_t k = 0; k < PERIOD_TICKS; k++) {
+        step(k);
+        TEST_ASSERT_TRUE(estimator.hydraulics[SWING].strikes < 3 && estimator.hydraulics[WRIST].strikes < 3);
+    }
+    uint8_t before = 0;
+    for (uint32_t k = PERIOD_TICKS; k < PERIOD_TICKS + MOVE_TICKS / 2; k++) {
+        struct estimator_sample sample = sample_at(k);
+        sample.flow[WRIST] = -sample.flow[WRIST];
+        if (k == PERIOD_TICKS + MOVE_TICKS / 2 - 100) {
+            TEST_ASSERT_TRUE(before > 50);
+            estimator.hydraulics[WRIST].strikes = before = 240; /* sooner at the end of the count */
+        }
+        estimator_step(&estimator, parameters, &constants, &machine.arm, &sample);
+        TEST_ASSERT_TRUE(estimator.hydraulics[SWING].strikes < 3);
+        TEST_ASSERT_TRUE(estimator.hydraulics[WRIST].strikes == 0 ||
+                         estimator.hydraulics[WRIST].strikes <= before + 1);
+        before = estimator.hydraulics[WRIST].strikes;
+    }
+    TEST_ASSERT_EQUAL_UINT8(255, estimator.hydraulics[WRIST].strikes);
+    run(PERIOD_TICKS + MOVE_TICKS / 2, 3 * PERIOD_TICKS); /* what it had learned has been unlearned */
+    TEST_ASSERT_EQUAL_UINT8(0, estimator.hydraulics[WRIST].strikes);
+    estimator.hydraulics[WRIST].strikes = 7;
+    estimator_resume(&estimator);
+    TEST_ASSERT_EQUAL_UINT8(0, estimator.hydraulics[WRIST].strikes);
+}
+
+static void test_count_of_changed_loads_starts_again(void)
+{
+    /* GIVEN a count of changed loads at its end WHEN one more is noticed THEN it stays there: supervision counts its
+     * growth and must not see 65536 of them */
+    run(0, 2 * PERIOD_TICKS);
+    estimator.reopened = UINT16_MAX - 1u;
+    plant.load_kg = 12;
+    run(2 * PERIOD_TICKS, 3 * PERIOD_TICKS);
+    plant.load_kg = 1;
+    run(3 * PERIOD_TICKS, 4 * PERIOD_TICKS);
+    TEST_ASSERT_EQUAL_UINT16(UINT16_MAX, estimator.reopened);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -580,5 +723,11 @@ int main(void)
     RUN_TEST(test_load_forgotten_at_another_rate);
     RUN_TEST(test_new_load_ignored_after_long_certainty);
     RUN_TEST(test_one_strange_sample_taken_for_a_new_load);
+    RUN_TEST(test_doubtful_samples_taken_while_held);
+    RUN_TEST(test_commissioning_finds_the_priors);
+    RUN_TEST(test_commissioning_takes_its_surprises_for_a_load);
+    RUN_TEST(test_operation_forgets_what_commissioning_found);
+    RUN_TEST(test_sensors_that_contradict_each_other_not_noticed);
+    RUN_TEST(test_count_of_changed_loads_starts_again);
     return UNITY_END();
 }

@@ -15,11 +15,12 @@ static inline int64_t clock_now_ns(void)
     return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
 }
 
-/* The ECU's now_us: CLOCK_MONOTONIC in us, modulo 2^32. The context is not used. */
-static inline uint32_t clock_port_now_us(void *context)
+/* CLOCK_REALTIME in ns: the clock with which the kernel marks frames that come. */
+static inline int64_t clock_of_frames_ns(void)
 {
-    (void)context;
-    return (uint32_t)(clock_now_ns() / NS_PER_US);
+    struct timespec now;
+    (void)clock_gettime(CLOCK_REALTIME, &now);
+    return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
 }
 
 #endif

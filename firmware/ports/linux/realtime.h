@@ -1,4 +1,4 @@
-/* What a desktop Linux grants towards real time, for the strict pace. */
+/* What a desktop Linux grants towards real time, for paces with a timer. */
 #ifndef PORTS_LINUX_REALTIME_H
 #define PORTS_LINUX_REALTIME_H
 

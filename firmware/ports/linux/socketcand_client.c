@@ -2,6 +2,7 @@
 #include "ports/linux/socketcand_client.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <netdb.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -9,6 +10,7 @@
 #include <stdio.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "ports/linux/clock.h"
@@ -47,7 +49,7 @@ static bool socketcand_flush(void *context)
     struct socketcand_client *client = context;
     while (client->bus.state == BUS_UP && client->sent_bytes < client->queued_bytes) {
         const ssize_t count = send(client->bus.fd, client->transmit + client->sent_bytes,
-                                   client->queued_bytes - client->sent_bytes, MSG_NOSIGNAL);
+                                   client->queued_bytes - client->sent_bytes, MSG_NOSIGNAL | MSG_DONTWAIT);
         if (count >= 0) {
             client->sent_bytes += (size_t)count;
         } else if (errno == EAGAIN) {
@@ -77,7 +79,8 @@ static bool make_room(struct socketcand_client *client, size_t count)
     return client->queued_bytes + count <= sizeof client->transmit;
 }
 
-/* Only collects: the frames of one step of the tick leave in one segment, by socketcand_flush. */
+/* The first frame after a read leaves at once: that of a tick is the valve frame. The others are collected, so that
+ * those of one step of the tick leave in one segment, by socketcand_flush. */
 static enum port_status socketcand_send(void *context, const struct can_frame_11bit *frame)
 {
     struct socketcand_client *client = context;
@@ -92,6 +95,11 @@ static enum port_status socketcand_send(void *context, const struct can_frame_11
     }
     memcpy(client->transmit + client->queued_bytes, text, length);
     client->queued_bytes += length;
+    if (!client->collects) {
+        client->collects = true;
+        (void)socketcand_flush(client);
+    }
+    client->bus.came_ns = 0;
     return PORT_OK;
 }
 
@@ -100,16 +108,24 @@ enum read_result { READ_SOME, READ_NOTHING, READ_END };
 /* Replaces the parsed bytes by new ones. READ_END leaves the reason in the bus. */
 static enum read_result read_more(struct socketcand_client *client)
 {
-    ssize_t count;
-    do {
-        count = recv(client->bus.fd, client->received, sizeof client->received, 0);
-    } while (count < 0 && errno == EINTR);
+    union {
+        struct cmsghdr align;
+        char bytes[CMSG_SPACE(sizeof(struct timespec))];
+    } control;
+    struct iovec part = {.iov_base = client->received, .iov_len = sizeof client->received};
+    struct msghdr header = {
+        .msg_iov = &part, .msg_iovlen = 1, .msg_control = &control, .msg_controllen = sizeof control};
+    const ssize_t count = recvmsg(client->bus.fd, &header, client->bus.may_wait ? 0 : MSG_DONTWAIT);
+    client->bus.may_wait = false;
     client->parsed_bytes = 0;
     client->received_bytes = count > 0 ? (size_t)count : 0;
+    client->read_all = client->received_bytes < sizeof client->received;
     if (count > 0) {
+        client->collects = false;
+        client->bus.came_ns = bus_message_time_ns(&header);
         return READ_SOME;
     }
-    if (count < 0 && errno == EAGAIN) {
+    if (count < 0 && (errno == EAGAIN || errno == EINTR)) {
         return READ_NOTHING;
     }
     if (count == 0 || errno == ECONNRESET) {
@@ -145,7 +161,9 @@ static enum port_status socketcand_receive(void *context, struct can_frame_11bit
             go_down(client, BUS_REFUSED, "refused by", message.text);
             break;
         case SOCKETCAND_NOTHING:
-            if (read_more(client) == READ_NOTHING) {
+            /* After a read that took all, another would find nothing: that call is spared. */
+            if (client->read_all || read_more(client) == READ_NOTHING) {
+                client->read_all = false;
                 client->bus.drained = true;
                 return PORT_EMPTY;
             }
@@ -207,6 +225,8 @@ static int connect_once(struct socketcand_client *client, const struct addrinfo 
         (void)close(fd);
         return error;
     }
+    /* From here on only the loop decides what waits, call by call. */
+    (void)fcntl(fd, F_SETFL, fcntl(fd, F_GETFL) & ~O_NONBLOCK);
     client->bus.fd = fd;
     return 0;
 }
@@ -328,10 +348,8 @@ bool socketcand_open(struct socketcand_client *client, const char *host, const c
                      const char *channel)
 {
     memset(client, 0, sizeof *client);
-    client->bus.port = (struct ecu_port){.context = client,
-                                         .send = socketcand_send,
-                                         .receive = socketcand_receive,
-                                         .now_us = clock_port_now_us};
+    client->bus.port = (struct ecu_port){
+        .context = client, .send = socketcand_send, .receive = socketcand_receive, .now_us = bus_now_us};
     client->bus.fd = -1;
     client->bus.flush = socketcand_flush;
     client->bus.close = socketcand_close;
@@ -347,6 +365,7 @@ bool socketcand_open(struct socketcand_client *client, const char *host, const c
     (void)setsockopt(client->bus.fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
     (void)setsockopt(client->bus.fd, SOL_SOCKET, SO_RCVBUF, &receive_bytes, sizeof receive_bytes);
     (void)setsockopt(client->bus.fd, SOL_SOCKET, SO_SNDBUF, &transmit_bytes, sizeof transmit_bytes);
+    (void)setsockopt(client->bus.fd, SOL_SOCKET, SO_TIMESTAMPNS, &on, sizeof on);
     if (!shake_hands(client, channel)) {
         (void)close(client->bus.fd);
         client->bus.fd = -1;

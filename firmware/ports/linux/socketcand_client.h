@@ -20,6 +20,8 @@ struct socketcand_client {
     struct socketcand_parser parser;
     size_t received_bytes; /* in `received` */
     size_t parsed_bytes;   /* of these, already parsed */
+    bool collects;         /* something was sent since the last read: more is sent with the next flush */
+    bool read_all;         /* the last read left nothing in the kernel */
     size_t queued_bytes;   /* in `transmit` */
     size_t sent_bytes;     /* of these, already with the kernel */
     char received[SOCKETCAND_RECEIVE_BYTES];
