@@ -3,7 +3,7 @@
 /* Where column j of U begins. */
 static inline uint8_t column(uint8_t j)
 {
-    return j > 0u ? (uint8_t)(j * (j - 1) / 2) : 0u;
+    return j > 0u ? (uint8_t)(j * (j - 1u) / 2u) : (uint8_t)0;
 }
 
 void ud_start(struct ud_factors *ud, uint8_t size, const variance prior[])
