@@ -13,16 +13,21 @@ ROOT = Path(__file__).resolve().parents[1]
 NEEDED = ("numpy", "numba", "can", "cantools", "rich")
 
 
-def enter(script: str) -> None:
+def enter(script: str, *, mf4: bool = False) -> None:
     """Continue in the project's environment, or say which command prepares it and exit with status 2.
 
     Parameters
     ----------
     script : str
         ``__file__`` of the script that was started.
+    mf4 : bool
+        The script reads or writes .mf4 files. python-can imports asammdf wherever it is installed, which takes
+        longer than all the rest of a start; the others do without.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if not missing:
+        if not mf4:
+            sys.modules.setdefault("asammdf", None)  # type: ignore[arg-type]
         return
     python = ROOT / ".venv" / "bin" / "python"
     if python.exists() and "DIARC_ENTERED" not in os.environ:

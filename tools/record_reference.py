@@ -24,7 +24,7 @@ sys.path[0] = str(ROOT)
 
 from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
-enter(__file__)
+enter(__file__, mf4=True)
 
 import can  # noqa: E402
 import numpy as np  # noqa: E402

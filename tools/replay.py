@@ -25,7 +25,7 @@ sys.path[0] = str(ROOT)
 
 from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
-enter(__file__)
+enter(__file__, mf4=True)
 
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn  # noqa: E402

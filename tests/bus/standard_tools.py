@@ -52,6 +52,8 @@ def run_line(line: str) -> dict:
 
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", int(ROWS), int(COLUMNS), 0, 0))
     start, told, seen, status = time.monotonic(), 0, b"", None
+    log = FOLDER / line.split(" -f ")[1].split()[0] if endless else None
+    logs_since = None
     while time.monotonic() - start < LINE_LIMIT_S:
         ended, raw = os.waitpid(child, os.WNOHANG)
         if ended:
@@ -66,10 +68,14 @@ def run_line(line: str) -> dict:
             seen += chunk
         shown = b"ESTIMATE" in seen if "cantools" in line else b"0x181" in seen or b"181" in seen
         due = (shown and time.monotonic() - start > SCREEN_S) or time.monotonic() - start > LINE_LIMIT_S / 2
-        logged = endless and time.monotonic() - start > 2 * SCREEN_S
+        if log is not None and logs_since is None and log.exists():
+            logs_since = time.monotonic()
+        logged = logs_since is not None and time.monotonic() - logs_since > SCREEN_S
         if (screen and due) or logged:
             os.write(terminal, b"q" if screen and told < 3 else b"\x03")
             told += 1
+            # a second Ctrl-C would break the first one's tidy end
+            logs_since = time.monotonic() + LINE_LIMIT_S / 4 if endless else None
             time.sleep(0.5)
     else:
         os.kill(child, signal.SIGKILL)
