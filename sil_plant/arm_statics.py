@@ -271,3 +271,28 @@ def fastest_rate(machine: Machine, joint: int) -> float:
     pull, push = stall_forces(machine, joint)
     speed = c.kv * math.sqrt(max(push, -pull) / (c.area1**3 + c.area2**3))
     return speed / float(c.lever(c.angles()).min())
+
+
+BRAKE_PEAK = 1.5  # of a smooth stop: largest over mean deceleration
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What it takes to stop a joint from its peak rate."""
+
+    rate: float  # rad/s
+    brake: float  # torque to stop within the time, N m
+    spare: float  # torque that the cylinder has beside what it holds, N m
+    shortest_s: float
+
+
+def stop_from_peak(machine: Machine, joint: int, motion: Motion, load_kg: float, stop_s: float) -> Stop:
+    """Torque of a safe stop at the shortest lever arm of the moves, and the shortest time it can be done in."""
+    c = cylinder_of(machine, joint)
+    pull, push = stall_forces(machine, joint)
+    rate = float(np.abs(motion.w[:, joint]).max())
+    lever = float(c.lever(motion.q[:, joint]).min())
+    held = float(gravity_torque(machine, 0.0, load_kg)) if joint == 1 else 0.0
+    momentum = BRAKE_PEAK * rate * float(inertia(machine, joint, 0.0, load_kg))
+    spare = max(min(lever * push - held, held - lever * pull), 1e-9)  # stops a fall; stops a rise
+    return Stop(rate, momentum / stop_s, spare, momentum / spare)

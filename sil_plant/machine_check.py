@@ -25,6 +25,7 @@ from sil_plant.arm_statics import (
     natural_frequency,
     quickest,
     stall_forces,
+    stop_from_peak,
 )
 from sil_plant.linear_loop import least_margin, loop_gains
 from sil_plant.machine import JOINT_NAMES, Machine
@@ -41,7 +42,6 @@ LEVER_SPREAD_LEAST = 0.25
 MARGIN_TIGHT_UP, MARGIN_TIGHT_DOWN = 1.25, 0.8
 VALVE_PER_RESONANCE = 2.0
 SPOOL_NOISE_MOST = 0.05
-BRAKE_PEAK = 1.5  # of a smooth stop: largest over mean deceleration
 
 
 @dataclass(frozen=True)
@@ -400,23 +400,14 @@ def safe_stop(case: Case) -> Iterator[Finding]:
     m = case.machine
     stop_s = m["supervision.stop_s"]
     for joint, name in enumerate(JOINT_NAMES):
-        c = cylinder_of(m, joint)
-        peak = float(np.abs(case.motion.w[:, joint]).max())
-        if peak == 0.0:
-            continue
-        pull, push = stall_forces(m, joint)
-        lever = float(c.lever(case.motion.q[:, joint]).min())
-        brake = BRAKE_PEAK * peak / stop_s * float(inertia(m, joint, 0.0, case.full_load_kg))
-        held = float(gravity_torque(m, 0.0, case.full_load_kg)) if joint == 1 else 0.0
-        upward, downward = lever * push - held, -lever * pull + held  # what can stop a fall, and a rise
-        have = min(upward, downward)
-        if brake > have:
-            needed = stop_s * brake / max(have, 1e-9)
+        stop = stop_from_peak(m, joint, case.motion, case.full_load_kg, stop_s)
+        if stop.brake > stop.spare:
             what = (
-                f"a stop from {peak:.2f} rad/s within {stop_s:g} s takes {brake:.0f} N m with {case.full_load_kg:g} kg; the "
-                f"{name}'s cylinder has {max(have, 0.0):.0f} N m to spare where its lever arm is shortest: it overshoots"
+                f"a stop from {stop.rate:.2f} rad/s within {stop_s:g} s takes {stop.brake:.0f} N m with "
+                f"{case.full_load_kg:g} kg; the {name}'s cylinder has {stop.spare:.0f} N m to spare where its lever arm is "
+                "shortest: it overshoots"
             )
-            advice = f"stop_s = {min(max(needed, stop_s), 2.0):.2g}, or slower moves"
+            advice = f"stop_s = {min(stop.shortest_s, 2.0):.2g}, or slower moves"
             yield Finding(WARNING, "supervision.stop_s", what, advice)
 
 

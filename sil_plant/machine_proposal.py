@@ -20,6 +20,7 @@ from sil_plant.arm_statics import (
     inertia,
     motion_of,
     natural_frequency,
+    stop_from_peak,
 )
 from sil_plant.config import ConfigError
 from sil_plant.inproc import SCALARS, InprocEcu
@@ -327,7 +328,9 @@ class Proposer:
         add("supervision.bound_s", 0.5, "a load beyond the range is one for longer than this")
         add("supervision.late_ticks", 20, "strict pace: 2 % of a second")
         add("supervision.send_ticks", 5, "a bus that is gone, not one that is busy")
-        add("supervision.stop_s", 0.2, "see the check of the safe stop")
+        stops = [stop_from_peak(m, joint, self.motion, self.full_load_kg, 0.2).shortest_s for joint in range(2)]
+        stop_s = min(max(two_digits(1.2 * max(stops)), 0.2), 2.0)
+        add("supervision.stop_s", stop_s, f"1.2 times what the cylinders need with the full load, {max(stops):.2f} s; 0.2 at least")
         for joint, name in enumerate(JOINT_NAMES):
             rate = fastest_rate(m, joint)
             why = f"1.3 times what the full valve does at the shortest lever arm, {rate:.1f} rad/s"
@@ -442,7 +445,7 @@ def number(value: float) -> str:
     """A number as TOML, as short as it can be."""
     if isinstance(value, int):
         return str(value)
-    text = f"{value:.6g}"
+    text = f"{value:.6g}".replace("e+0", "e").replace("e-0", "e-")
     return text if any(c in text for c in ".en") else f"{text}.0"
 
 
