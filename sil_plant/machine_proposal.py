@@ -178,7 +178,7 @@ class Proposer:
                 f"a sixth of the Coulomb friction and the pressure noise's {noise:.2g} N m, squares added",
             )
             self.add(
-                f"estimator.{name}.flow_noise_m2_s", two_digits(self.full_QL(joint) / 1500.0), "QL at full opening / 1500"
+                f"estimator.{name}.flow_noise_m2_s", two_digits(self.full_QL(joint) / 3000.0), "QL at full opening / 3000"
             )
 
     # ---- the law -------------------------------------------------------------------------------------
