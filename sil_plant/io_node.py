@@ -41,6 +41,7 @@ class NodeLayout(NamedTuple):
     pressure_step: float
     spool_step: float
     command_step: float
+    heartbeat_id: int
 
 
 class NodeErrors(NamedTuple):
@@ -60,6 +61,7 @@ class NodeTiming(NamedTuple):
     period_s: float
     delay_s: float
     timeout_ticks: int
+    heartbeat_ticks: int
 
 
 class Node(NamedTuple):
@@ -103,6 +105,7 @@ def node_layout() -> NodeLayout:
         pressure_step=protocol.scale("PRESSURES_SWING", "BorePressure") * 1e5,
         spool_step=protocol.scale("PRESSURES_SWING", "SpoolPosition") / 100.0,
         command_step=protocol.scale("VALVES", "SwingSpool") / 100.0,
+        heartbeat_id=protocol.frame_id("HEARTBEAT_IO"),
     )
 
 
@@ -120,9 +123,11 @@ def node_errors(machine: Machine) -> NodeErrors:
     )
 
 
-def heartbeat_row() -> np.ndarray:
-    """The node's heartbeat frame."""
-    return frames.to_row(protocol.frame_id("HEARTBEAT_IO"), bytes((_NMT_OPERATIONAL,)))
+@njit(cache=True)
+def node_heartbeat(layout: NodeLayout, row: np.ndarray) -> None:
+    """Make a row the node's heartbeat."""
+    write_header(row, layout.heartbeat_id, 1)
+    row[frames.DATA] = _NMT_OPERATIONAL
 
 
 def node_timing(machine: Machine, period_s: float) -> NodeTiming:
@@ -131,6 +136,7 @@ def node_timing(machine: Machine, period_s: float) -> NodeTiming:
         period_s=period_s,
         delay_s=min(machine["io.command_delay_s"], period_s),
         timeout_ticks=max(1, round(machine["io.valve_timeout_s"] / period_s)),
+        heartbeat_ticks=max(1, round(IO_HEARTBEAT_S / period_s)),
     )
 
 
