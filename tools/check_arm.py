@@ -6,6 +6,7 @@ Examples
   python tools/check_arm.py crane.toml --scenario crane_moves.toml --load 100
   python tools/check_arm.py crane.toml --load 100 --propose            gains and limits for it, with reasons
   python tools/check_arm.py crane.toml --load 100 --write whole.toml   the file, what is missing filled in
+  python tools/check_arm.py crane.toml --params crane.commissioned.toml --write known.toml    with what was found
   python tools/check_arm.py crane.toml --plots out                     lever arms, pressures, flow over the moves
 
 Nothing is simulated: run.py does that. Exit: 0 it can work (notes and warnings are left), 1 it cannot, 2 wrong use.
@@ -29,6 +30,7 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
+from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.machine import Machine  # noqa: E402
 from sil_plant.machine_check import Case, check_machine, make_case, with_lines  # noqa: E402
@@ -60,6 +62,7 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--load", type=float, metavar="KG", help="the heaviest load; default: the scenario's heaviest")
     parser.add_argument("--propose", action="store_true", help="print bases, gains, limits and priors for this machine")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the file with what is missing filled in")
+    parser.add_argument("--params", type=Path, metavar="FILE", help="commissioned set from tools/commission.py, goes in")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="draw lever arms, and pressures and flow in motion")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     return parser.parse_args(argv)
@@ -77,8 +80,12 @@ def full_load(arguments: argparse.Namespace, scenario: Scenario) -> float:
 def check(
     arguments: argparse.Namespace, keys: MachineKeys, scenario: Scenario, load_kg: float
 ) -> tuple[list[Finding], dict[str, Proposal], Case | None]:
-    """All findings, the proposals, and the case if the machine could be looked at as a whole."""
+    """All findings, the proposals, and the case if the machine could be looked at as a whole.
+
+    Values of a commissioned set count as proposals, too.
+    """
     findings = [*keys.findings, *relation_findings(keys)]
+    findings.sort(key=lambda f: "keys are missing" in f.what)  # what can be proposed comes last
     wrong = [f for f in findings if f.severity == ERROR]
     if keys.toml is None or not keys.physical_complete or any(not is_proposed(f.key) for f in wrong):
         return findings, {}, None
@@ -95,6 +102,11 @@ def check(
         if missing:
             what = f"{len(missing)} keys of {', '.join(only_missing)} are not in the file; the checks use proposals"
             findings.append(Finding(NOTE, "(file)", what))
+    if arguments.params:
+        known = load_commissioned(arguments.params, machine)
+        found = {key: value for key, value in known.values.items() if value != machine.values[key]}
+        proposals |= {key: Proposal(key, value, "commissioned") for key, value in found.items()}
+        machine = known
     case = make_case(machine, scenario, load_kg)
     return findings + with_lines(check_machine(case), keys.line), proposals, case
 
@@ -173,7 +185,8 @@ def outputs(
     if case is None:
         return written
     if arguments.write:
-        text, kept = complete_text(keys, {key: p for key, p in proposals.items() if key in keys.missing})
+        wanted = {key: p for key, p in proposals.items() if key in keys.missing or p.reason == "commissioned"}
+        text, kept = complete_text(keys, wanted)
         try:
             arguments.write.write_text(text, encoding="utf-8")
         except OSError as error:
