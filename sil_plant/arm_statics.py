@@ -59,7 +59,7 @@ class Cylinder(NamedTuple):
         return self.dead_volume + self.area1 * x, self.dead_volume + self.area2 * (self.stroke - x)
 
     def stiffness(self, q: np.ndarray | float) -> np.ndarray:
-        """lamA = A1^2/V1 + A2^2/V2, m: spring rate over bulk modulus."""
+        """LamA = A1^2/V1 + A2^2/V2, m: spring rate over bulk modulus."""
         volume1, volume2 = self.volumes(q)
         return self.area1**2 / volume1 + self.area2**2 / volume2
 

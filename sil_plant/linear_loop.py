@@ -129,26 +129,27 @@ def places(machine: Machine, joint: int, loads_kg: tuple[float, ...]) -> list[Jo
     return found
 
 
-def _plant(joint: Joint, factor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Continuous plant and its input column."""
-    a = np.zeros((_PLANT, _PLANT))
-    a[0, 1] = 1.0
-    a[1, 1], a[1, 2] = -joint.fv / joint.H, joint.R / joint.H
-    a[2, 1] = -joint.bulk * joint.lamA * joint.R
-    a[2, 3] = joint.bulk * joint.valve_gain * factor
-    a[3, 4] = 1.0
-    a[4, 3], a[4, 4] = -(joint.valve_w**2), -2.0 * joint.valve_damping * joint.valve_w
-    b = np.zeros(_PLANT)
-    b[4] = joint.valve_w**2
-    return a, b
+class Held(NamedTuple):
+    """The plant over the two parts of a tick, before and after the set-point changes: state matrix, input column."""
+
+    first: tuple[np.ndarray, np.ndarray]
+    second: tuple[np.ndarray, np.ndarray]
 
 
-def _held(a: np.ndarray, b: np.ndarray, duration_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """The plant over a time in which its input is held."""
+@functools.lru_cache(maxsize=256)
+def _held(joint: Joint) -> Held:
+    """The plant with its set-point held; its spool counts in flow that the law knows of, see `tick_map`."""
     whole = np.zeros((_PLANT + 1, _PLANT + 1))
-    whole[:_PLANT, :_PLANT], whole[:_PLANT, _PLANT] = a, b
-    e = expm(whole * duration_s)
-    return e[:_PLANT, :_PLANT], e[:_PLANT, _PLANT]
+    whole[0, 1] = 1.0
+    whole[1, 1], whole[1, 2] = -joint.fv / joint.H, joint.R / joint.H
+    whole[2, 1] = -joint.bulk * joint.lamA * joint.R
+    whole[2, 3] = joint.bulk * joint.valve_gain
+    whole[3, 4] = 1.0
+    whole[4, 3], whole[4, 4] = -(joint.valve_w**2), -2.0 * joint.valve_damping * joint.valve_w
+    whole[4, _PLANT] = joint.valve_w**2
+    rest_s = math.fmod(joint.delay + 1e-12, PERIOD_S)
+    first, second = (expm(whole * duration_s) for duration_s in (rest_s, PERIOD_S - rest_s))
+    return Held((first[:_PLANT, :_PLANT], first[:_PLANT, _PLANT]), (second[:_PLANT, :_PLANT], second[:_PLANT, _PLANT]))
 
 
 @functools.cache
@@ -157,10 +158,10 @@ def _observer(bandwidth: float) -> tuple[float, float]:
     return 1.0 - rho**2, (1.0 - rho) ** 2 / PERIOD_S
 
 
-def _law(joint: Joint, gains: LoopGains, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _law(joint: Joint, gains: LoopGains, size: int, factor: float) -> tuple[np.ndarray, np.ndarray]:
     """The set-point as a row on the state at SYNC, and the law's states after the tick as rows."""
     unit = np.eye(size)
-    q, force, spool = unit[0], unit[2], unit[3]
+    q, force, spool = unit[0], unit[2], unit[3] / factor
     observed, observed_rate, gamma1, gamma2 = unit[_PLANT : _PLANT + 4]
     correct_error, correct_rate = _observer(gains.observer)
     predicted = observed + PERIOD_S * observed_rate
@@ -204,18 +205,16 @@ def tick_map(joint: Joint, gains: LoopGains, factor: float = 1.0) -> np.ndarray:
     factor : float
         How much more the valve passes than the law believes.
     """
-    whole_ticks = int(joint.delay / PERIOD_S + 1e-9)
-    rest_s = joint.delay - whole_ticks * PERIOD_S
+    whole_ticks = int((joint.delay + 1e-12) / PERIOD_S)
     old = whole_ticks + 1  # set-points on their way, newest first
     size = _PLANT + 4 + old
-    command, law_after = _law(joint, gains, size)
-    a, b = _plant(joint, factor)
-    first_a, first_b = _held(a, b, rest_s)
-    second_a, second_b = _held(a, b, PERIOD_S - rest_s)
+    # a valve that passes more is one whose set-point and spool are larger than the law believes
+    command, law_after = _law(joint, gains, size, factor)
+    (first_a, first_b), (second_a, second_b) = _held(joint)
     unit = np.eye(size)
     sent = [command, *unit[_PLANT + 4 :]]  # set-point of this tick, of the one before, ..
-    after = first_a @ unit[:_PLANT] + np.outer(first_b, sent[whole_ticks + 1])
-    after = second_a @ after + np.outer(second_b, sent[whole_ticks])
+    after = first_a @ unit[:_PLANT] + np.outer(factor * first_b, sent[whole_ticks + 1])
+    after = second_a @ after + np.outer(factor * second_b, sent[whole_ticks])
     return np.vstack([after, law_after, np.array(sent[:old])])
 
 

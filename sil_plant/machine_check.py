@@ -111,7 +111,9 @@ def geometry(case: Case) -> Iterator[Finding]:
                 f"no such cylinder: retracted it would be {1e3 * c.shortest:.0f} mm between the pins, which is not more "
                 f"than its stroke of {1e3 * c.stroke:.0f} mm"
             )
-            advice = "check crank_a_m, crank_b_m and crank_q0_rad (the angle between the two at q = 0) against the drawing"
+            advice = (
+                "check crank_a_m, crank_b_m and crank_q0_rad (the angle between the two at q = 0) against the drawing"
+            )
             yield Finding(ERROR, f"{name}.crank_a_m", what, advice)
         margin = m["supervision.angle_margin_rad"] * float(c.lever(np.array([c.q_min, c.q_max])).max())
         if margin > c.margin:
@@ -129,7 +131,9 @@ def _volumes(name: str, dead: float, swept: float) -> Iterator[Finding]:
         more = "times as much as" if dead > swept else "of"
         ratio = f"{dead / swept:.0f}" if dead > swept else f"{dead / swept:.2%}"
         what = f"dead volume {1e6 * dead:.4g} cm^3, {ratio} {more} what the piston sweeps ({1e6 * swept:.4g} cm^3)"
-        yield Finding(WARNING, f"{name}.dead_volume_m3", what, "one chamber with its line to the valve: 1 cm^3 is 1e-6 m^3")
+        yield Finding(
+            WARNING, f"{name}.dead_volume_m3", what, "one chamber with its line to the valve: 1 cm^3 is 1e-6 m^3"
+        )
 
 
 def holding(case: Case) -> Iterator[Finding]:
@@ -194,7 +198,9 @@ def flow(case: Case) -> Iterator[Finding]:
     pump = max(float(d.pump_flow.max()) for d in case.demands)
     if pump > 0.0:
         sag = case.machine["effects.supply_sag_Pa_s_m3"] * pump
-        what = f"the pump (or accumulator) must give {pump * LITRES_PER_MINUTE:.1f} l/min at full pressure in these moves"
+        what = (
+            f"the pump (or accumulator) must give {pump * LITRES_PER_MINUTE:.1f} l/min at full pressure in these moves"
+        )
         if sag > 0.1 * case.machine["supply.pressure_Pa"]:
             what += f"; effects.supply_sag_Pa_s_m3 then takes {sag / BAR:.0f} bar"
             yield Finding(WARNING, "supply.pressure_Pa", what, "slower moves, or a larger pump")
@@ -228,7 +234,9 @@ def _opening(case: Case, joint: int, name: str) -> Iterator[Finding]:
     if spool > 1.0:
         needed = most / (OPENING_TIGHT - overlap) * m[f"{name}.valve_kv"]
         slower = longest * most / (OPENING_TIGHT - overlap)
-        what = f"saturated: {quick} needs {spool:.0%} of the valve, with {load:g} kg; the arm falls behind its reference"
+        what = (
+            f"saturated: {quick} needs {spool:.0%} of the valve, with {load:g} kg; the arm falls behind its reference"
+        )
         advice = f"a valve with kv = {needed:.2g}, or {slower:.2g} s for this move (both leave {1 - OPENING_TIGHT:.0%} to spare)"
         yield Finding(ERROR, f"{name}.valve_kv", what, advice)
     elif spool > OPENING_TIGHT:
@@ -278,7 +286,9 @@ def resonance(case: Case) -> Iterator[Finding]:
         else:
             yield Finding(NOTE, name, what)
         if high < 0.3:
-            yield Finding(WARNING, "oil.bulk_modulus_Pa", f"a resonance of {high:.2f} Hz is that of no arm", "check the units")
+            yield Finding(
+                WARNING, "oil.bulk_modulus_Pa", f"a resonance of {high:.2f} Hz is that of no arm", "check the units"
+            )
     observer = m["control.observer_rad_s"]
     fastest = max(m[f"control.{name}.k2_1_s"] for name in JOINT_NAMES)
     if observer < 2.0 * fastest:
@@ -323,7 +333,9 @@ def noise(case: Case) -> Iterator[Finding]:
         rms = g.k3 * compliance * g.k2 * H / float(c.lever(middle)) * observer * encoder / gain
         if rms > SPOOL_NOISE_MOST:
             what = f"encoder noise of {m['sensors.encoder_noise_rad']:g} rad shakes the {name}'s spool by about {rms:.0%} of its travel"
-            yield Finding(WARNING, "sensors.encoder_noise_rad", what, "a better encoder, a slower observer, or lower k2, k3")
+            yield Finding(
+                WARNING, "sensors.encoder_noise_rad", what, "a better encoder, a slower observer, or lower k2, k3"
+            )
 
 
 def estimate(case: Case) -> Iterator[Finding]:
@@ -339,18 +351,31 @@ def estimate(case: Case) -> Iterator[Finding]:
         yield Finding(WARNING, "estimator.prior.m_t_kg.sd", what, f"about the heaviest load, {full:g}")
     if high > 3.0 * max(heaviest, 0.0) and high > 1.6 * full:
         what = f"{high:g} kg is far beyond what the cylinder holds ({heaviest:.3g} kg)"
-        yield Finding(WARNING, "estimator.prior.m_t_kg.high", what, "1.5 times the heaviest load; the robust gain grows with it")
+        yield Finding(
+            WARNING, "estimator.prior.m_t_kg.high", what, "1.5 times the heaviest load; the robust gain grows with it"
+        )
     scale = gravity_torque(m, 0.0, full) - gravity_torque(m, 0.0, 0.0)
     torque_noise = m["estimator.wrist.torque_noise_Nm"]
     if full and torque_noise > 0.2 * scale:
-        what = f"{torque_noise:g} N m is {torque_noise / scale:.0%} of the torque of {full:g} kg: the load is hardly seen"
-        yield Finding(WARNING, "estimator.wrist.torque_noise_Nm", what, f"a sixth of the Coulomb friction: {m['wrist.coulomb_Nm'] / 6.0:.2g}")
+        what = (
+            f"{torque_noise:g} N m is {torque_noise / scale:.0%} of the torque of {full:g} kg: the load is hardly seen"
+        )
+        yield Finding(
+            WARNING,
+            "estimator.wrist.torque_noise_Nm",
+            what,
+            f"a sixth of the Coulomb friction: {m['wrist.coulomb_Nm'] / 6.0:.2g}",
+        )
     gate = m["estimator.gate_rate_rad_s"]
     for joint, name in enumerate(JOINT_NAMES):
         peak = float(np.abs(case.motion.w[:, joint]).max())
         if 0.0 < peak < 2.0 * gate:
-            what = f"the {name} moves at {peak:.3f} rad/s at most, the gate opens at {gate:g}: nothing is learned from it"
-            yield Finding(WARNING, "estimator.gate_rate_rad_s", what, f"a twentieth of the peak rate: {0.05 * peak:.2g}")
+            what = (
+                f"the {name} moves at {peak:.3f} rad/s at most, the gate opens at {gate:g}: nothing is learned from it"
+            )
+            yield Finding(
+                WARNING, "estimator.gate_rate_rad_s", what, f"a twentieth of the peak rate: {0.05 * peak:.2g}"
+            )
     low, high = m["wrist.q_min_rad"], m["wrist.q_max_rad"]
     cosines = np.cos(np.linspace(low, high, 61))
     if float(np.ptp(cosines)) < 0.1:
@@ -374,13 +399,17 @@ def limits(case: Case) -> Iterator[Finding]:
             fast = max(1.3 * fastest_rate(m, joint), 3.0 * peak)
             yield Finding(ERROR, key, what, f"what the full valve can do and some more: {fast:.2g}")
         elif peak + noisy > 0.8 * limit:
-            yield Finding(WARNING, key, f"{limit:g} rad/s is hardly more than the {peak:.2f} rad/s of these moves", "raise it")
+            yield Finding(
+                WARNING, key, f"{limit:g} rad/s is hardly more than the {peak:.2f} rad/s of these moves", "raise it"
+            )
     if m["supervision.pressure_max_Pa"] <= supply:
         what = f"{m['supervision.pressure_max_Pa'] / BAR:.0f} bar is not above the supply pressure ({supply / BAR:.0f} bar)"
         yield Finding(ERROR, "supervision.pressure_max_Pa", what, f"1.5 times the supply pressure: {1.5 * supply:.2g}")
     if m["supervision.pressure_range_Pa"] < m["supervision.pressure_max_Pa"]:
         what = "the sensors end below the over-pressure limit, which is then never seen"
-        yield Finding(WARNING, "supervision.pressure_range_Pa", what, "the end of the sensors' range, above pressure_max_Pa")
+        yield Finding(
+            WARNING, "supervision.pressure_range_Pa", what, "the end of the sensors' range, above pressure_max_Pa"
+        )
     if m["supervision.pressure_min_Pa"] >= tank > 0.0:
         what = f"the cavitation limit is not below the tank pressure ({tank / BAR:.1f} bar): a chamber that drains trips it"
         yield Finding(ERROR, "supervision.pressure_min_Pa", what, f"a tenth of the tank pressure: {0.1 * tank:.2g}")
@@ -392,7 +421,9 @@ def limits(case: Case) -> Iterator[Finding]:
     step = m["supervision.pressure_step_Pa"]
     if step < 0.3 * worst:
         what = f"{step / BAR:.0f} bar in a tick; the full valve makes up to {worst / BAR:.0f} bar at a piston's end"
-        yield Finding(WARNING, "supervision.pressure_step_Pa", what, f"{1.2 * worst:.2g}, or SENSOR_RATE stops a healthy arm")
+        yield Finding(
+            WARNING, "supervision.pressure_step_Pa", what, f"{1.2 * worst:.2g}, or SENSOR_RATE stops a healthy arm"
+        )
 
 
 def safe_stop(case: Case) -> Iterator[Finding]:

@@ -74,7 +74,9 @@ def geometry_figure(case: Case) -> Figure:
     """Over the joints' ranges: lever arms, spring rate as resonance, and the wrist's holding pressures."""
     m = case.machine
     figure = _figure(0.42)
-    figure.suptitle(f"{m.name}: geometry and statics, loads 0 to {case.full_load_kg:g} kg", x=0.012, ha="left", weight="bold")
+    figure.suptitle(
+        f"{m.name}: geometry and statics, loads 0 to {case.full_load_kg:g} kg", x=0.012, ha="left", weight="bold"
+    )
     levers, resonances, pressures = figure.subplots(1, 3)
     for joint, name in enumerate(JOINT_NAMES):
         c = cylinder_of(m, joint)
@@ -86,7 +88,9 @@ def geometry_figure(case: Case) -> Figure:
             resonances.plot(q, f, color=JOINT_COLOURS[joint], linestyle=style, label=label)
     levers.set_ylim(bottom=0.0)
     resonances.set_yscale("log")
-    ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if resonances.get_ylim()[0] <= t <= resonances.get_ylim()[1]]
+    ticks = [
+        t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200) if resonances.get_ylim()[0] <= t <= resonances.get_ylim()[1]
+    ]
     resonances.set_yticks(ticks, [f"{t:g}" for t in ticks])
     resonances.minorticks_off()
     c = cylinder_of(m, 1)
@@ -95,16 +99,20 @@ def geometry_figure(case: Case) -> Figure:
         bore = (gravity_torque(m, q, load) / c.lever(q) + total * c.area2) / (c.area1 + c.area2)
         for side, colour, p in zip(SIDES, SIDE_COLOURS, (bore, total - bore), strict=True):
             pressures.plot(q, p / BAR, color=colour, linestyle=style, label=f"{side}, {load:g} kg")
-    _limits(pressures, m["supply.tank_Pa"] / BAR, m["supply.pressure_Pa"] / BAR)
+    _limits(pressures, tank=m["supply.tank_Pa"] / BAR, supply=m["supply.pressure_Pa"] / BAR)
     _finish(levers, "Lever arm dX/dq", "mm/rad", "joint angle, rad")
     _finish(resonances, "Hydraulic resonance", "Hz", "joint angle, rad", 1.6)
-    _finish(pressures, "Wrist at rest; dotted: tank, supply", "bar", "wrist angle, rad", 0.35)
+    _finish(pressures, "Wrist at rest", "bar", "wrist angle, rad", 0.35)
     return figure
 
 
-def _limits(axes: Axes, *values: float) -> None:
-    for value in values:
+def _limits(axes: Axes, **values: float) -> None:
+    for name, value in values.items():
         axes.axhline(value, color=LIMIT_COLOUR, linestyle=(0, (1, 2)), linewidth=1.4)
+        axes.annotate(
+            name, (0.01, value), xycoords=("axes fraction", "data"), xytext=(0, 2), textcoords="offset points",
+            fontsize=9.0, color="#5A5A5A",
+        )  # fmt: skip
 
 
 def moves_figure(case: Case) -> Figure:
@@ -118,13 +126,13 @@ def moves_figure(case: Case) -> Figure:
         size = np.where(np.isinf(demand.opening[:, joint]), np.nan, demand.opening[:, joint])
         signed = np.sign(demand.speed[:, joint]) * size
         opening.plot(time_s, 100.0 * signed, color=JOINT_COLOURS[joint], label=name)
-    _limits(opening, -100.0, 100.0)
+    _limits(opening, **{"full travel": 100.0, "full travel back": -100.0})
     pump.plot(time_s, LITRES_PER_MINUTE * demand.pump_flow, color="#000000", label="both cylinders")
     for joint, (axes, name) in enumerate(zip(lower, JOINT_NAMES, strict=True)):
         for side, colour, p in zip(SIDES, SIDE_COLOURS, demand.pressure[:, joint].T, strict=True):
             axes.plot(time_s, p / BAR, color=colour, label=side)
-        _limits(axes, m["supply.tank_Pa"] / BAR, m["supply.pressure_Pa"] / BAR)
-        _finish(axes, f"Pressures, {name}; dotted: tank, supply", "bar", "time from the start of motion, s")
+        _limits(axes, tank=m["supply.tank_Pa"] / BAR, supply=m["supply.pressure_Pa"] / BAR)
+        _finish(axes, f"Pressures, {name}", "bar", "time from the start of motion, s")
     _finish(opening, "Spool opening, positive extends", "% of travel", "")
     _finish(pump, "Flow from the pump", "l/min", "")
     return figure

@@ -178,7 +178,9 @@ class Proposer:
                 f"a sixth of the Coulomb friction and the pressure noise's {noise:.2g} N m, squares added",
             )
             self.add(
-                f"estimator.{name}.flow_noise_m2_s", two_digits(self.full_QL(joint) / 3000.0), "QL at full opening / 3000"
+                f"estimator.{name}.flow_noise_m2_s",
+                two_digits(self.full_QL(joint) / 3000.0),
+                "QL at full opening / 3000",
             )
 
     # ---- the law -------------------------------------------------------------------------------------
@@ -243,7 +245,9 @@ class Proposer:
         )
         self.add(f"{key}.kappa1_1_s2", g.kappa1, f"{KAPPA1_PER_K2_SQUARED:g} k2^2")
         self.add(f"{key}.kappa2_1_s2", g.kappa2, f"{KAPPA2_PER_K3_SQUARED:g} k3^2")
-        self.add(f"{key}.w1_over_w2_m", g.w1_over_w2, f"{MU_PER_SPRING:g} lamA: half of the oil's own spring acts on errors")
+        self.add(
+            f"{key}.w1_over_w2_m", g.w1_over_w2, f"{MU_PER_SPRING:g} lamA: half of the oil's own spring acts on errors"
+        )
         self.robust(joint, key, g)
         self.add(f"{key}.spool_lead", g.spool_lead, "the same for every machine so far")
         self.pid(joint, key)
@@ -310,7 +314,9 @@ class Proposer:
         why = "1.2 times what a valve can do in 1 ms to the smallest volume"
         add("supervision.pressure_step_Pa", two_digits(1.2 * max(steps)), why)
         sensors = two_digits(min(1.25 * highest, HIGHEST_PRESSURE_PA))
-        add("supervision.pressure_range_Pa", sensors, "put the end of YOUR sensors' range here; 1.25 times pressure_max")
+        add(
+            "supervision.pressure_range_Pa", sensors, "put the end of YOUR sensors' range here; 1.25 times pressure_max"
+        )
         add("supervision.angle_range_rad", 0.2, "beyond the stops no angle is real")
         add("supervision.stuck_rad", 0.003, "many steps of an encoder")
         add("supervision.stuck_s", 0.1, "many samples of pressure noise")
@@ -330,7 +336,11 @@ class Proposer:
         add("supervision.send_ticks", 5, "a bus that is gone, not one that is busy")
         stops = [stop_from_peak(m, joint, self.motion, self.full_load_kg, 0.2).shortest_s for joint in range(2)]
         stop_s = min(max(two_digits(1.2 * max(stops)), 0.2), 2.0)
-        add("supervision.stop_s", stop_s, f"1.2 times what the cylinders need with the full load, {max(stops):.2f} s; 0.2 at least")
+        add(
+            "supervision.stop_s",
+            stop_s,
+            f"1.2 times what the cylinders need with the full load, {max(stops):.2f} s; 0.2 at least",
+        )
         for joint, name in enumerate(JOINT_NAMES):
             rate = fastest_rate(m, joint)
             why = f"1.3 times what the full valve does at the shortest lever arm, {rate:.1f} rad/s"
@@ -369,7 +379,8 @@ class Proposer:
     ) -> tuple[tuple[int, ...], str]:
         """The exponents nearest to the ideal ones that the firmware takes, and what it says if it takes none."""
         near = [
-            (ideal[0] + 2 * p, ideal[1] + 2 * a, ideal[2] + r) for p, a, r in product((0, -1, 1), (0, -1, 1), (0, -1, 1, 2))
+            (ideal[0] + 2 * p, ideal[1] + 2 * a, ideal[2] + r)
+            for p, a, r in product((0, -1, 1), (0, -1, 1), (0, -1, 1, 2))
         ]
         near = [
             e
@@ -382,7 +393,9 @@ class Proposer:
         for exponents in near:
             values = {key: p.value for key, p in self.found.items() if not key.startswith("base.")}
             base = dict(zip(BASE_KEYS, exponents, strict=True))
-            problem = firmware_refusal(Machine(self.machine.name, self.machine.path, base, self.machine.values | values))
+            problem = firmware_refusal(
+                Machine(self.machine.name, self.machine.path, base, self.machine.values | values)
+            )
             if not problem:
                 return exponents, ""
         return (near[0] if near else ideal), problem
@@ -437,7 +450,12 @@ def _order() -> list[str]:
     for section in ("control", "supervision", "estimator"):
         mine = [name for name in names if name.startswith(f"{section}.")]
         stems = list(dict.fromkeys(name.rsplit(".", 1)[0] for name in mine))
-        keys += [name for stem in sorted(stems, key=lambda s: s.count(".")) for name in mine if name.rsplit(".", 1)[0] == stem]
+        keys += [
+            name
+            for stem in sorted(stems, key=lambda s: s.count("."))
+            for name in mine
+            if name.rsplit(".", 1)[0] == stem
+        ]
     return keys
 
 
@@ -462,4 +480,3 @@ def as_toml(proposals: dict[str, Proposal], reasons: bool = True) -> str:
         comment = proposal.reason if reasons else ""
         lines.append(f"{text:<32}# {comment}" if comment else text)
     return "\n".join(lines) + "\n"
-

@@ -62,8 +62,12 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--load", type=float, metavar="KG", help="the heaviest load; default: the scenario's heaviest")
     parser.add_argument("--propose", action="store_true", help="print bases, gains, limits and priors for this machine")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the file with what is missing filled in")
-    parser.add_argument("--params", type=Path, metavar="FILE", help="commissioned set from tools/commission.py, goes in")
-    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="draw lever arms, and pressures and flow in motion")
+    parser.add_argument(
+        "--params", type=Path, metavar="FILE", help="commissioned set from tools/commission.py, goes in"
+    )
+    parser.add_argument(
+        "--plots", type=Path, metavar="FOLDER", help="draw lever arms, and pressures and flow in motion"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of text")
     return parser.parse_args(argv)
 
