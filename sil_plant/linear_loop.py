@@ -1,4 +1,4 @@
-"""The closed loop of one joint, linearised at rest: how far is it from ringing?
+"""The closed loop of one joint, linearised at rest: how far it is from ringing.
 
 One tick of plant and law is a linear map of one state vector: angle, rate, cylinder force, spool and its rate, the
 observer's two states, gamma1 and gamma2, and the set-points that are still on their way. The loop is stable while no

@@ -1,4 +1,4 @@
-"""What the numbers of a machine file mean together: will this arm hold, move, and be controlled?
+"""What the numbers of a machine file mean together: whether this arm will hold, move, and be controlled.
 
 Each check looks at one thing and says what it found with its figures; keys, units and ranges come before, in
 machine_keys.py. Nothing is simulated: geometry, statics, quasi-static flow, and the linear loop.
@@ -101,14 +101,16 @@ def geometry(case: Case) -> Iterator[Finding]:
         if least < LEVER_SPREAD_LEAST * most:
             where = float(q[int(np.argmin(lever))])
             what = (
-                f"near a dead point: at {where:.2f} rad the lever arm is {1e3 * least:.1f} mm, {least / most:.0%} of its "
+                f"near a dead point: at {where:.2f} rad the lever arm is {1e3 * least:.1f} mm, "
+                f"{least / most:.0%} of its "
                 "largest; there the cylinder is weak and every pressure error a large torque error"
             )
             end = "q_min_rad" if where < 0.5 * (c.q_min + c.q_max) else "q_max_rad"
             yield Finding(WARNING, f"{name}.{end}", what, f"move {end} away from it, or turn the crank (crank_q0_rad)")
         if c.shortest <= c.stroke:
             what = (
-                f"no such cylinder: retracted it would be {1e3 * c.shortest:.0f} mm between the pins, which is not more "
+                f"no such cylinder: retracted it would be {1e3 * c.shortest:.0f} mm between the pins, which is "
+                "not more "
                 f"than its stroke of {1e3 * c.stroke:.0f} mm"
             )
             advice = (
@@ -150,7 +152,8 @@ def holding(case: Case) -> Iterator[Finding]:
             at = float(q[int(np.argmax(force))])
             needed = math.sqrt(max(float(force.max()), 1.0) / push) * m["wrist.bore_m"]
             what = (
-                f"the wrist does not hold {load:g} kg: at {at:.2f} rad it needs {force.max() / 1e3:.1f} kN, the cylinder "
+                f"the wrist does not hold {load:g} kg: at {at:.2f} rad it needs {force.max() / 1e3:.1f} kN, the "
+                "cylinder "
                 f"pushes {push / 1e3:.1f} kN"
             )
             if heaviest > 0.0:
@@ -160,7 +163,10 @@ def holding(case: Case) -> Iterator[Finding]:
             return
         spare = min(float((supply - np.maximum(bore, supply + tank - bore)).min()), float((bore - tank).min()))
         low, high = float(bore.min()) / BAR, float(bore.max()) / BAR
-        what = f"holds {load:g} kg with {low:.0f} to {high:.0f} bar on the bore side (tank {tank / BAR:.0f}, supply {supply / BAR:.0f})"
+        what = (
+            f"holds {load:g} kg with {low:.0f} to {high:.0f} bar on the bore side (tank {tank / BAR:.0f}, "
+            f"supply {supply / BAR:.0f})"
+        )
         if spare < PRESSURE_SPARE_PA:
             advice = "a larger bore or more supply pressure; the valve needs pressure to move the load, too"
             yield Finding(WARNING, "wrist.bore_m", f"{what}: hardly any left", advice)
@@ -180,7 +186,10 @@ def poses(case: Case) -> Iterator[Finding]:
         low, high = m[f"{name}.q_min_rad"], m[f"{name}.q_max_rad"]
         asked = [case.scenario.start_pose_rad[joint], *(s.target_rad for s in case.scenario.segments[joint])]
         if min(asked) < low or max(asked) > high:
-            what = f"the moves of {case.scenario.name} ask for {min(asked):g} to {max(asked):g} rad; it can {low:g} to {high:g}"
+            what = (
+                f"the moves of {case.scenario.name} ask for {min(asked):g} to {max(asked):g} rad; it can "
+                f"{low:g} to {high:g}"
+            )
             end = "q_min_rad" if min(asked) < low else "q_max_rad"
             yield Finding(ERROR, f"{name}.{end}", what, "give the moves of this machine with --scenario FILE")
     high = m["estimator.prior.m_t_kg.high"]
@@ -223,7 +232,8 @@ def _opening(case: Case, joint: int, name: str) -> Iterator[Finding]:
     if math.isinf(most):
         weak = worst.force[int(np.argmin(worst.room[:, joint])), joint]
         what = (
-            f"too weak: with {load:g} kg, {quick} needs {weak / 1e3:.1f} kN, more than the cylinder has between tank and "
+            f"too weak: with {load:g} kg, {quick} needs {weak / 1e3:.1f} kN, more than the cylinder has between "
+            "tank and "
             "supply pressure"
         )
         yield Finding(ERROR, f"{name}.bore_m", what, "slower moves, less load, a larger bore, or more supply pressure")
@@ -237,7 +247,10 @@ def _opening(case: Case, joint: int, name: str) -> Iterator[Finding]:
         what = (
             f"saturated: {quick} needs {spool:.0%} of the valve, with {load:g} kg; the arm falls behind its reference"
         )
-        advice = f"a valve with kv = {needed:.2g}, or {slower:.2g} s for this move (both leave {1 - OPENING_TIGHT:.0%} to spare)"
+        advice = (
+            f"a valve with kv = {needed:.2g}, or {slower:.2g} s for this move (both leave "
+            f"{1 - OPENING_TIGHT:.0%} to spare)"
+        )
         yield Finding(ERROR, f"{name}.valve_kv", what, advice)
     elif spool > OPENING_TIGHT:
         advice = "a larger valve or a slower move: what is left is what disturbances are fought with"
@@ -256,13 +269,20 @@ def _moving_pressures(case: Case, joint: int, name: str) -> Iterator[Finding]:
         if low < m["supervision.pressure_min_Pa"]:
             side = ("bore", "annulus")[int(np.argmin(pressure.min(axis=0)))]
             what = (
-                f"cavitation: with {d.load_kg:g} kg the {side} side falls to {low / BAR:.1f} bar, because the load pulls "
+                f"cavitation: with {d.load_kg:g} kg the {side} side falls to {low / BAR:.1f} bar, because the "
+                "load pulls "
                 "the piston along faster than the valve fills behind it"
             )
-            advice = "slower moves that go with the load; a valve that throttles the outlet more than the inlet is not modelled"
+            advice = (
+                "slower moves that go with the load; a valve that throttles the outlet more than the inlet is "
+                "not modelled"
+            )
             yield Finding(WARNING, f"{name}.valve_kv", what, advice)
         if high > m["supervision.pressure_max_Pa"]:
-            what = f"over-pressure: with {d.load_kg:g} kg a side of the {name} rises to {high / BAR:.0f} bar in these moves"
+            what = (
+                f"over-pressure: with {d.load_kg:g} kg a side of the {name} rises to {high / BAR:.0f} bar in "
+                "these moves"
+            )
             yield Finding(ERROR, "supervision.pressure_max_Pa", what, "slower moves, a larger bore, or a higher limit")
 
 
@@ -303,13 +323,19 @@ def margins(case: Case) -> Iterator[Finding]:
         gains = loop_gains(m, joint)
         found = least_margin(m, joint, gains, tuple(d.load_kg for d in case.demands))
         valve = 2.0 * math.pi * m[f"{name}.valve_frequency_Hz"]
-        figures = f"k1 {gains.k1:g}, k2 {gains.k2:g}, k3 {gains.k3:g} 1/s, valve {valve:.0f} rad/s, delay {1e3 * m['io.command_delay_s']:g} ms"
+        figures = (
+            f"k1 {gains.k1:g}, k2 {gains.k2:g}, k3 {gains.k3:g} 1/s, valve {valve:.0f} rad/s, delay "
+            f"{1e3 * m['io.command_delay_s']:g} ms"
+        )
         advice = "--propose shows gains with a margin; k3 at most a third of the valve's rad/s, k2 0.3 and k1 0.2 of k3"
         if not found.stable:
             what = f"unstable: the loop rings up with {figures}, robust terms at their bounds"
             yield Finding(ERROR, f"control.{name}.k3_1_s", what, advice)
         elif found.up < MARGIN_TIGHT_UP or found.down > MARGIN_TIGHT_DOWN:
-            what = f"little margin: it rings when the valve passes {found.up:.2f} or {found.down:.2f} times what it should ({figures})"
+            what = (
+                f"little margin: it rings when the valve passes {found.up:.2f} or {found.down:.2f} times what "
+                f"it should ({figures})"
+            )
             yield Finding(WARNING, f"control.{name}.k3_1_s", what, advice)
         else:
             what = f"stable while the valve passes {found.down:.2f} to {found.up:.2f} times what it should ({figures})"
@@ -332,7 +358,10 @@ def noise(case: Case) -> Iterator[Finding]:
         compliance = m["estimator.prior.beta_inverse_1_Pa.value"]
         rms = g.k3 * compliance * g.k2 * H / float(c.lever(middle)) * observer * encoder / gain
         if rms > SPOOL_NOISE_MOST:
-            what = f"encoder noise of {m['sensors.encoder_noise_rad']:g} rad shakes the {name}'s spool by about {rms:.0%} of its travel"
+            what = (
+                f"encoder noise of {m['sensors.encoder_noise_rad']:g} rad shakes the {name}'s spool by about "
+                f"{rms:.0%} of its travel"
+            )
             yield Finding(
                 WARNING, "sensors.encoder_noise_rad", what, "a better encoder, a slower observer, or lower k2, k3"
             )
@@ -379,7 +408,10 @@ def estimate(case: Case) -> Iterator[Finding]:
     low, high = m["wrist.q_min_rad"], m["wrist.q_max_rad"]
     cosines = np.cos(np.linspace(low, high, 61))
     if float(np.ptp(cosines)) < 0.1:
-        what = f"over {low:g} to {high:g} rad cos(q) changes by {np.ptp(cosines):.2f}: gravity looks like a constant offset"
+        what = (
+            f"over {low:g} to {high:g} rad cos(q) changes by {np.ptp(cosines):.2f}: gravity looks like a "
+            "constant offset"
+        )
         yield Finding(WARNING, "wrist.q_max_rad", what, "commissioning needs a wrist that is also raised or lowered")
 
 
@@ -395,7 +427,10 @@ def limits(case: Case) -> Iterator[Finding]:
         peak = float(np.abs(case.motion.w[:, joint]).max())
         noisy = 2.0 * m["sensors.encoder_noise_rad"] / 1e-3
         if peak + noisy > limit:
-            what = f"{limit:g} rad/s trips SENSOR_RATE in these moves: {peak:.2f} rad/s and {noisy:.2f} rad/s of encoder noise"
+            what = (
+                f"{limit:g} rad/s trips SENSOR_RATE in these moves: {peak:.2f} rad/s and {noisy:.2f} rad/s of "
+                "encoder noise"
+            )
             fast = max(1.3 * fastest_rate(m, joint), 3.0 * peak)
             yield Finding(ERROR, key, what, f"what the full valve can do and some more: {fast:.2g}")
         elif peak + noisy > 0.8 * limit:
@@ -403,7 +438,10 @@ def limits(case: Case) -> Iterator[Finding]:
                 WARNING, key, f"{limit:g} rad/s is hardly more than the {peak:.2f} rad/s of these moves", "raise it"
             )
     if m["supervision.pressure_max_Pa"] <= supply:
-        what = f"{m['supervision.pressure_max_Pa'] / BAR:.0f} bar is not above the supply pressure ({supply / BAR:.0f} bar)"
+        what = (
+            f"{m['supervision.pressure_max_Pa'] / BAR:.0f} bar is not above the supply pressure "
+            f"({supply / BAR:.0f} bar)"
+        )
         yield Finding(ERROR, "supervision.pressure_max_Pa", what, f"1.5 times the supply pressure: {1.5 * supply:.2g}")
     if m["supervision.pressure_range_Pa"] < m["supervision.pressure_max_Pa"]:
         what = "the sensors end below the over-pressure limit, which is then never seen"
@@ -411,7 +449,10 @@ def limits(case: Case) -> Iterator[Finding]:
             WARNING, "supervision.pressure_range_Pa", what, "the end of the sensors' range, above pressure_max_Pa"
         )
     if m["supervision.pressure_min_Pa"] >= tank > 0.0:
-        what = f"the cavitation limit is not below the tank pressure ({tank / BAR:.1f} bar): a chamber that drains trips it"
+        what = (
+            f"the cavitation limit is not below the tank pressure ({tank / BAR:.1f} bar): a chamber that "
+            "drains trips it"
+        )
         yield Finding(ERROR, "supervision.pressure_min_Pa", what, f"a tenth of the tank pressure: {0.1 * tank:.2g}")
     worst = 0.0
     for joint in range(2):
@@ -435,7 +476,8 @@ def safe_stop(case: Case) -> Iterator[Finding]:
         if stop.brake > stop.spare:
             what = (
                 f"a stop from {stop.rate:.2f} rad/s within {stop_s:g} s takes {stop.brake:.0f} N m with "
-                f"{case.full_load_kg:g} kg; the {name}'s cylinder has {stop.spare:.0f} N m to spare where its lever arm is "
+                f"{case.full_load_kg:g} kg; the {name}'s cylinder has {stop.spare:.0f} N m to spare where its "
+                "lever arm is "
                 "shortest: it overshoots"
             )
             advice = f"stop_s = {min(stop.shortest_s, 2.0):.2g}, or slower moves"

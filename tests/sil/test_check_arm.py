@@ -96,7 +96,8 @@ MISTAKES = [
     ("high = 15.0", "high = 8.0", "error", "estimator.prior.m_t_kg.high", "below the load of 10 kg"),
     ("[supervision.swing]\nrate_rad_s = 4.0", "[supervision.swing]\nrate_rad_s = 0.5", "error",
      "supervision.swing.rate_rad_s", "SENSOR_RATE"),
-    ("pressure_max_Pa = 200e5", "pressure_max_Pa = 90e5", "error", "supervision.pressure_max_Pa", "not above the supply"),
+    ("pressure_max_Pa = 200e5", "pressure_max_Pa = 90e5", "error", "supervision.pressure_max_Pa",
+     "not above the supply"),
     ("pressure_min_Pa = 0.3e5", "pressure_min_Pa = 5e5", "error", "supervision.pressure_min_Pa", "tank"),
     ("stop_s = 0.2", "stop_s = 0.02", "warning", "supervision.stop_s", "overshoots"),
     ("pressure_log2 = 22", "pressure_log2 = 21", "error", "base.pressure_log2", "odd"),
@@ -300,7 +301,7 @@ def test_proposed_gains_do_not_track_much_worse_than_those_tuned_by_hand(name: s
 
 
 def test_what_is_proposed_passes_the_check_and_says_why(check: Callable[..., Checked], tmp_path: Path) -> None:
-    """GIVEN the physical part of both machines WHEN proposed for THEN it works, and every value but bounds has a reason."""
+    """GIVEN the physical part of both machines WHEN proposed for THEN it works, and each value has a reason."""
     for arm, arguments in ((REFERENCE_ARM, ("--load", "10")), (ARMS / "loader.toml", LOADER[1:])):
         path = tmp_path / arm.name
         path.write_text(physical_only(arm.read_text(encoding="utf-8")), encoding="utf-8")

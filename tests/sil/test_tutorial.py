@@ -30,7 +30,7 @@ from sil_plant.hub import Hub
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
-LIMIT_S = 60.0
+LIMIT_S = 120.0
 TOLERANCE = 0.15
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 FENCE = re.compile(r"^```(\w*)\s*$")
@@ -186,21 +186,19 @@ def checkout(tmp_path: Path) -> Path:
     """A folder that looks like the project's, in which the reader's files do not get into the project."""
     for name in ("tools", "sil_plant", "firmware", "can_protocol", "docs"):
         (tmp_path / name).symlink_to(ROOT / name)
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    launcher = tmp_path / "bin" / "python"  # a link to the interpreter would lose its environment
+    launcher.parent.mkdir()
+    launcher.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")
+    launcher.chmod(0o755)
     return tmp_path
 
 
-@pytest.mark.timeout(240)
+@pytest.mark.timeout(600)
 def test_the_tutorial_leads_to_a_tracked_arm(checkout: Path) -> None:
     """GIVEN a checkout WHEN the tutorial is done from its first line to its last
     THEN every command ends as the text says and prints what the text shows.
     """
-    launcher = checkout / "bin" / "python"
-    launcher.unlink()
-    launcher.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")  # keeps its environment
-    launcher.chmod(0o755)
-    environment = os.environ | {"PATH": f"{launcher.parent}:{os.environ['PATH']}"}
+    environment = os.environ | {"PATH": f"{checkout / 'bin'}:{os.environ['PATH']}"}
     blocks = read_blocks(TUTORIAL.read_text(encoding="utf-8"))
     assert sum(len(b.commands()) for b in blocks if "file" not in b.marks) >= 12
     for block in blocks:
