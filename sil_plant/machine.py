@@ -146,8 +146,9 @@ def load_parameter_table(path: Path = PARAMETERS) -> ParameterTable:
     return ParameterTable(tuple(entries), int.from_bytes(digest[:4], "big"), bases)
 
 
-def _ranges(table: ParameterTable) -> dict[str, tuple[float, float]]:
-    ranges = {entry.name: (entry.low, entry.high) for entry in table.entries}
+def machine_ranges() -> dict[str, tuple[float, float]]:
+    """Every number that a machine file can have, and its range."""
+    ranges = {entry.name: (entry.low, entry.high) for entry in load_parameter_table().entries}
     for key, bounds in PLANT_RANGES.items():
         for joint in JOINT_NAMES if "*" in key else ("",):
             ranges[key.replace("*", joint)] = bounds
@@ -155,7 +156,7 @@ def _ranges(table: ParameterTable) -> dict[str, tuple[float, float]]:
     return ranges
 
 
-def _prior_values(values: dict[str, float]) -> dict[str, float]:
+def prior_values(values: dict[str, float]) -> dict[str, float]:
     """What the priors' values are when the file leaves them to its other sections."""
     mass, length = values["wrist.mass_kg"], values["wrist.link_length_m"]
     prior = {
@@ -188,7 +189,7 @@ def load_machine(path: Path) -> Machine:
     """
     toml = TomlFile(path)
     table = load_parameter_table()
-    ranges = _ranges(table)
+    ranges = machine_ranges()
     found = dict(flatten(toml.data))
     name = found.pop("name", path.stem)
     if not isinstance(name, str):
@@ -219,7 +220,7 @@ def load_machine(path: Path) -> Machine:
     for key in ranges:
         if key not in values and key not in optional:
             raise toml.error(key, "is missing")
-    values = {key: default for key, (default, _, _) in EFFECTS.items()} | _prior_values(values) | values
+    values = {key: default for key, (default, _, _) in EFFECTS.items()} | prior_values(values) | values
     _check_relations(toml, values)
     return Machine(name=name, path=path, base=base, values=values)
 
@@ -263,7 +264,7 @@ def with_changes(machine: Machine, changes: dict[str, float], where: str) -> Mac
     ConfigError
         For an unknown key or a value outside its range.
     """
-    ranges = _ranges(load_parameter_table())
+    ranges = machine_ranges()
     for key, value in changes.items():
         if key not in ranges or key not in machine.values:
             raise ConfigError(f"{where}: {key} is not a number of {machine.path.name}")
