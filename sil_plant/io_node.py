@@ -156,20 +156,14 @@ def follow(node: Node, hysteresis: float) -> None:
 
 
 @njit(cache=True)
-def advance_one_period(
-    node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
-) -> None:
-    """Integrate over one period: the old set-points up to the delay, then the new ones.
+def command_delay(timing: NodeTiming, errors: NodeErrors, jitter: float) -> float:
+    """From SYNC until a command takes effect, s; ``jitter`` -1..1 says how far it is off in this period."""
+    return min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
 
-    Parameters
-    ----------
-    node, plant, timing, errors
-        The node.
-    jitter : float
-        -1..1, how far the delay is off in this period, in units of the jitter.
-    """
-    delay_s = min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
-    integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
+
+@njit(cache=True)
+def take_command(node: Node, timing: NodeTiming, errors: NodeErrors) -> None:
+    """Put the command that waits into effect; without one for too long, close the valves."""
     count = node.count
     if count[COMMAND_NEW]:
         count[COMMAND_NEW] = 0
@@ -183,31 +177,61 @@ def advance_one_period(
             node.u[0, 0] = 0.0
             node.u[0, 1] = 0.0
     follow(node, errors.hysteresis)
+
+
+@njit(cache=True)
+def advance_one_period(
+    node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
+) -> None:
+    """Integrate over one period: the old set-points up to the delay, then the new ones.
+
+    Parameters
+    ----------
+    node, plant, timing, errors
+        The node.
+    jitter : float
+        -1..1, how far the delay is off in this period, in units of the jitter.
+    """
+    delay_s = command_delay(timing, errors, jitter)
+    integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
+    take_command(node, timing, errors)
     integrate(node.y, node.u[2], node.load[0], plant, timing.period_s - delay_s, node.scratch)
 
 
 @njit(cache=True)
-def node_sync(
+def periods_due(node: Node, sync_counter: int) -> int:
+    """Periods from the SYNC before to this one, 0 at the first; ones that went missing are counted."""
+    count = node.count
+    periods = 0
+    if count[SYNC_LAST] > 0:
+        periods = (sync_counter - count[SYNC_LAST]) % 240
+        count[SYNC_LOST] += periods - 1
+        count[TICK] += periods
+    count[SYNC_LAST] = sync_counter
+    return periods
+
+
+@njit(cache=True)
+def node_sample(
     node: Node,
     plant: PlantParameters,
     layout: NodeLayout,
-    timing: NodeTiming,
     errors: NodeErrors,
     parked: bool,
     sync_counter: int,
     noise: np.ndarray,
     out: np.ndarray,
 ) -> int:
-    """Answer SYNC: bring the plant to this instant, sample, and pack the sensor frames.
+    """Sample the plant as it is now and pack the sensor frames.
 
     Parameters
     ----------
-    node, plant, layout, timing, errors
+    node, plant, layout, errors
         The node.
     parked : bool
-        The pump is off and the arm rests on its support: nothing moves, all chambers are at tank pressure.
+        The pump is off: all chambers are at tank pressure.
     sync_counter : int
-        1..240; missing ones are integrated over and counted.
+        1..240.
     noise : np.ndarray
         This tick's noise, shape (12,): two angles (rad), four pressures (Pa), sampling and delay jitter (-1..1),
         and for three sensor frames and the valve frame a number in 0..1 that decides whether it is lost.
@@ -219,16 +243,6 @@ def node_sync(
     int
         Rows written: three, less those that the bus loses.
     """
-    count = node.count
-    if count[SYNC_LAST] > 0:
-        periods = (sync_counter - count[SYNC_LAST]) % 240
-        count[SYNC_LOST] += periods - 1
-        for _ in range(periods):
-            if not parked:
-                advance_one_period(node, plant, timing, errors, noise[7])
-        count[TICK] += periods
-    count[SYNC_LAST] = sync_counter
-
     # The E2E counter of a sensor frame says which SYNC it answers.
     counter = (sync_counter - 1) % E2E_STATES
     y = node.y

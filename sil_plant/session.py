@@ -22,12 +22,14 @@ from sil_plant.io_node import (
     NodeErrors,
     NodeLayout,
     NodeTiming,
+    advance_one_period,
     make_node,
     node_errors,
     node_frame,
     node_layout,
-    node_sync,
+    node_sample,
     node_timing,
+    periods_due,
 )
 from sil_plant.machine import Machine
 from sil_plant.plant import STATES, PlantParameters, plant_parameters, state_at_rest
@@ -405,25 +407,30 @@ def update_references(session: Session, tick: int) -> None:
 
 
 @njit(cache=True)
-def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
-    """Answer SYNC: the plant moves on, the record gets a row, the answer is written to ``out``.
+def is_parked(session: Session) -> bool:
+    """The pump is off and the arm rests on its support: nothing moves, all chambers are at tank pressure."""
+    return session.progress.index[TICK] < session.timeline.parked
 
-    Returns
-    -------
-    int
-        Rows of ``out`` to send in this order: the master's commands of this tick, then the sensor frames.
-        -1 when the run is over: nothing was done. 0 for a SYNC that came twice.
-    """
-    index = session.progress.index
+
+@njit(cache=True)
+def begin_sync(session: Session, sync_counter: int) -> int:
+    """First part of :func:`on_sync`: 1 to go on, -1 when the run is over, 0 for a SYNC that came twice."""
+    index, schedule = session.progress.index, session.schedule
     tick = index[TICK]
     if tick >= session.noise.shape[0]:
         return -1
-    schedule, record, node = session.schedule, session.record, session.node
     if index[NEXT_LOAD] < schedule.load_tick.size and schedule.load_tick[index[NEXT_LOAD]] <= tick:
-        node.load[0] = schedule.load_kg[index[NEXT_LOAD]]
+        session.node.load[0] = schedule.load_kg[index[NEXT_LOAD]]
         index[NEXT_LOAD] += 1
-    if sync_counter == node.count[SYNC_LAST]:
-        return 0  # the same SYNC again: answered already
+    return 0 if sync_counter == session.node.count[SYNC_LAST] else 1
+
+
+@njit(cache=True)
+def answer_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
+    """Last part of :func:`on_sync`, once the plant has moved on: record, and write the answer to ``out``."""
+    index = session.progress.index
+    tick = index[TICK]
+    schedule, record, node = session.schedule, session.record, session.node
     rows = 0
     while (
         index[NEXT_FRAME] < schedule.frame_tick.size
@@ -434,13 +441,12 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
             out[rows, k] = schedule.frame_row[index[NEXT_FRAME], k]
         rows += 1
         index[NEXT_FRAME] += 1
-    rows += node_sync(
+    rows += node_sample(
         node,
         session.plant,
         session.layout,
-        session.timing,
         session.errors,
-        tick < session.timeline.parked,
+        is_parked(session),
         sync_counter,
         session.noise[tick],
         out[rows:],
@@ -456,6 +462,26 @@ def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     update_references(session, tick)
     index[TICK] = tick + 1
     return rows
+
+
+@njit(cache=True)
+def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
+    """Answer SYNC: the plant moves on, the record gets a row, the answer is written to ``out``.
+
+    Returns
+    -------
+    int
+        Rows of ``out`` to send in this order: the master's commands of this tick, then the sensor frames.
+        -1 when the run is over: nothing was done. 0 for a SYNC that came twice.
+    """
+    go_on = begin_sync(session, sync_counter)
+    if go_on <= 0:
+        return go_on  # over, or the same SYNC again: answered already
+    tick = session.progress.index[TICK]
+    for _ in range(periods_due(session.node, sync_counter)):
+        if not is_parked(session):
+            advance_one_period(session.node, session.plant, session.timing, session.errors, session.noise[tick, 7])
+    return answer_sync(session, sync_counter, out)
 
 
 @njit(cache=True)
