@@ -14,6 +14,7 @@ from sil_plant import bus_run, inproc, session
 from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.environment import say
+from sil_plant.external_plant import ExternalPlant, warm_up
 from sil_plant.machine import Machine
 from sil_plant.scenario import Scenario, with_load
 
@@ -59,8 +60,8 @@ class SpawnedEcu:
             self.process.wait()
 
 
-def compile_plant(machine: Machine, scenario: Scenario) -> None:
-    """Run a few ticks in memory, so that no compiling happens while a bus waits.
+def compile_plant(machine: Machine, scenario: Scenario, external: bool = False) -> None:
+    """Run a few ticks in memory, so that no compiling happens while a bus waits; ``external``: for another plant.
 
     Raises
     ------
@@ -69,7 +70,8 @@ def compile_plant(machine: Machine, scenario: Scenario) -> None:
     """
     from numba.core import config
 
-    if not any(Path(config.CACHE_DIR).glob("**/session.on_sync*.nbi")):
+    entry = "session.answer_sync" if external else "session.on_sync"
+    if not any(Path(config.CACHE_DIR).glob(f"**/{entry}*.nbi")):
         say("compiling the plant, once after installation (about 20 s) ...")
     short = with_load(replace(scenario, duration_s=0.01), 0.0)
     try:
@@ -78,13 +80,21 @@ def compile_plant(machine: Machine, scenario: Scenario) -> None:
         raise ConfigError(str(error)) from error
     inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
     bus_run.warm_up(warm)
+    if external:
+        warm_up(warm)
 
 
-def in_process(run: session.Session, image: bytes, scalar: str, progress: Callable[[int], None]) -> float:
+def in_process(
+    run: session.Session,
+    image: bytes,
+    scalar: str,
+    progress: Callable[[int], None],
+    plant: ExternalPlant | None = None,
+) -> float:
     """Run the session with the firmware in this process; the wall time it took, s."""
     ecu = inproc.InprocEcu(image, PERIOD_US, scalar)
     start = time.perf_counter()
-    while inproc.run_inproc(run, ecu, INPROC_CHUNK) == INPROC_CHUNK:
+    while inproc.run_inproc(run, ecu, INPROC_CHUNK, plant) == INPROC_CHUNK:
         progress(int(run.progress.index[session.TICK]))
         bus_run.check_hash(run)
     return time.perf_counter() - start
@@ -97,6 +107,7 @@ def over_bus(
     image: bytes,
     progress: Callable[[int], None],
     quiet: bool,
+    plant: ExternalPlant | None = None,
 ) -> float:
     """Run the session with an ECU on a bus.
 
@@ -114,6 +125,8 @@ def over_bus(
         Told the tick now and then.
     quiet : bool
         Say nothing but errors.
+    plant : ExternalPlant, optional
+        Another plant than ours.
 
     Returns
     -------
@@ -139,9 +152,9 @@ def over_bus(
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
         try:
-            bus_run.run_on_bus(run, port, progress, alive)
+            bus_run.run_on_bus(run, port, progress, alive, plant)
         except BusError as error:
-            bus_run.close_valves(run)
+            bus_run.close_valves(run, plant)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
         return time.perf_counter() - start
 

@@ -1,4 +1,4 @@
-"""What an FMU says about itself: ``modelDescription.xml`` of FMI 2.0 and 3.0 from one list of variables, and the zip."""
+"""What an FMU says of itself: ``modelDescription.xml`` of FMI 2.0 and 3.0 from one list of variables, and the zip."""
 
 from __future__ import annotations
 

@@ -10,7 +10,8 @@ from numba import njit, types
 from numba.types import WrapperAddressProtocol
 
 from sil_plant.config import ROOT, ConfigError
-from sil_plant.frames import FRAME_BYTES, frame_id
+from sil_plant.external_plant import ExternalPlant
+from sil_plant.frames import DATA, FRAME_BYTES, frame_id
 from sil_plant.protocol import SYNC_ID
 from sil_plant.session import OUT_ROWS, Session, on_frame, on_sync
 
@@ -134,8 +135,27 @@ def closed_loop(
     return ticks
 
 
-def run_inproc(session: Session, ecu: InprocEcu, ticks: int) -> int:
-    """Run at most ``ticks`` ticks; the number done."""
+def run_inproc(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant | None = None) -> int:
+    """Run at most ``ticks`` ticks, with another plant than ours if one is given; the number done."""
+    if plant is not None:
+        return _run_external(session, ecu, ticks, plant)
     rx = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
     return int(closed_loop(session, ecu.begin, ecu.end, np.uintp(ecu.pointer), ticks, rx, tx))
+
+
+def _run_external(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant) -> int:
+    """As :func:`closed_loop`, but for a plant that is not compiled with us."""
+    out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
+    for done in range(ticks):
+        rows = 0
+        for row in ecu.tick_begin():
+            if frame_id(row) == SYNC_ID:
+                rows = plant.on_sync(session, int(row[DATA]), out)
+            else:
+                on_frame(session, row)
+        if rows < 0:
+            return done
+        for row in ecu.tick_end(out[:rows]):
+            on_frame(session, row)
+    return ticks

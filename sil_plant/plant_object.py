@@ -63,7 +63,7 @@ def plant_object(parameters: PlantParameters) -> bytes:
     unflatten = _unflatten(parameters)
     count, scratch_shape = flatten(parameters).size, SCRATCH_SHAPE
 
-    def step(y, u, load_kg, values, duration_s, scratch):  # noqa: ANN001, ANN202 - numba's types, below
+    def step(y, u, load_kg, values, duration_s, scratch):
         integrate(
             carray(y, (STATES,)),
             carray(u, (2,)),
@@ -73,7 +73,7 @@ def plant_object(parameters: PlantParameters) -> bytes:
             carray(scratch, scratch_shape),
         )
 
-    def at_rest(q, load_kg, values, y):  # noqa: ANN001, ANN202
+    def at_rest(q, load_kg, values, y):
         return rest(carray(q, (2,)), load_kg, unflatten(carray(values, (count,))), carray(y, (STATES,)))
 
     real = types.float64
