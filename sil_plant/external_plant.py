@@ -27,6 +27,7 @@ from sil_plant.scenario import Scenario
 from sil_plant.session import OUT_ROWS, TICK, Session, answer_sync, begin_sync, is_parked
 
 FMI_VERSIONS = ("2.0", "3.0")
+START_WITHIN_RAD = 0.01  # of the pose that was asked for
 _MESSAGES_KEPT = 5
 
 
@@ -62,7 +63,7 @@ class ExternalPlant:
         self._step_s: float | None = None
         self._load_written: float | None = None
         self._spool = np.zeros(2)
-        self.absent = [
+        self._absent = [
             n for n, key in enumerate(STATE_KEYS) if key not in self.signals and not key.startswith("spools")
         ]
         order = [key for key in (*STATE_KEYS, "load.output") if key in self.signals]
@@ -119,10 +120,11 @@ class ExternalPlant:
         except Exception as error:
             raise ConfigError(f"{self.path}: cannot be started: {self._reason(error)}") from error
         for i, joint in enumerate(JOINTS):
-            if abs(node.y[i] - scenario.start_pose_rad[i]) > 0.01 and f"start.{joint}_angle" in self.signals:
+            pose, told = scenario.start_pose_rad[i], self.signals.get(f"start.{joint}_angle")
+            if told is not None and abs(node.y[i] - pose) > START_WITHIN_RAD:
                 raise ConfigError(
-                    f"{self.path}: {joint} starts at {node.y[i]:g} rad though {self.signals[f'start.{joint}_angle'].name} "
-                    f"was set to {scenario.start_pose_rad[i]:g}; check the map's [start]"
+                    f"{self.path}: {joint} starts at {node.y[i]:g} rad though {told.name} was set to {pose:g}; check "
+                    "[start] in the map"
                 )
 
     def __enter__(self) -> ExternalPlant:
@@ -160,7 +162,7 @@ class ExternalPlant:
             if not is_parked(session):
                 self.advance_one_period(session, session.noise[tick, 7])
         rows = answer_sync(session, sync_counter, out)
-        session.record.state[tick, self.absent] = np.nan
+        session.record.state[tick, self._absent] = np.nan
         if not any(key.startswith("load.") for key in self.signals) and self.map.load_constant_kg is None:
             session.record.load_true[tick] = np.nan
         return int(rows)
@@ -284,16 +286,12 @@ def _describe(fmu: Path) -> Any:
     if "modelDescription.xml" not in names:
         raise ConfigError(f"{fmu}: is no FMU: it has no modelDescription.xml")
     try:
-        version = fmpy.fmi_info(str(fmu))[0]
-        if version not in FMI_VERSIONS:
-            raise ConfigError(
-                f"{fmu}: is an FMU of FMI {version}; {' and '.join(FMI_VERSIONS)} can be used, export it so"
-            )
         model = fmpy.read_model_description(str(fmu), validate=False)
-    except ConfigError:
-        raise
     except Exception as error:
-        raise ConfigError(f"{fmu}: its modelDescription.xml cannot be read: {error}") from error
+        raise ConfigError(f"{fmu}: its modelDescription.xml cannot be read: {error}; export it anew") from error
+    version = model.fmiVersion
+    if version not in FMI_VERSIONS:
+        raise ConfigError(f"{fmu}: is an FMU of FMI {version}; {' and '.join(FMI_VERSIONS)} can be used, export it so")
     if model.coSimulation is None:
         kind = "model exchange" if model.modelExchange is not None else "scheduled execution"
         raise ConfigError(f"{fmu}: is for {kind} only; export it for co-simulation, with its solver")

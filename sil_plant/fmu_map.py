@@ -147,7 +147,7 @@ def load_map(path: Path) -> PlantMap:
     parameters = toml.data.pop("parameters", {})
     if not isinstance(parameters, dict):
         raise toml.error("parameters", "a table of the FMU's parameters and their values is needed")
-    parameters = {name: value for name, value in flatten(parameters)}
+    parameters = dict(flatten(parameters))
     for name, value in parameters.items():
         if not isinstance(value, bool | int | float | str):
             raise toml.error(f"parameters.{name}", f"a number, true, false or a text is needed, not {value!r}")

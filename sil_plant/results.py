@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -220,9 +221,8 @@ def write_csv(path: Path, record: Record, run: Run) -> None:
             writer = csv.writer(file)
             writer.writerow(CSV_COLUMNS)
             for row, mode in zip(columns.tolist(), record.mode[:n].tolist(), strict=True):
-                writer.writerow(
-                    [*("" if value != value else f"{value:.9g}" for value in row), MODE_NAMES.get(mode, str(mode))]
-                )
+                numbers = ("" if math.isnan(value) else f"{value:.9g}" for value in row)
+                writer.writerow([*numbers, MODE_NAMES.get(mode, str(mode))])
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 
