@@ -7,7 +7,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
 C_FILES = find firmware tests/unit tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images budget demo paper test lint format generate clean
+.PHONY: help setup firmware images fmu budget demo paper test lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -25,6 +25,12 @@ images: ## the Cortex-M images, build/cortex-m4f/diarc_ecu.elf and build/cortex-
 	@for preset in cortex-m4f cortex-m3; do \
 	    cmake --preset $$preset && cmake --build --preset $$preset --parallel $(JOBS) && \
 	    arm-none-eabi-size build/$$preset/diarc_ecu.elf || exit 1; done
+
+fmu: ## build/diarc_ecu.fmu and build/diarc_plant.fmu: the ECU and the arm for other simulation tools
+	@tools/setup.sh demo
+	@cmake --preset default -DDIARC_PYTHON=$(abspath $(PYTHON))
+	@cmake --build build --target fmu --parallel $(JOBS)
+	@$(PYTHON) tools/export_fmu.py plant -o build/diarc_plant.fmu
 
 budget: ## flash, RAM, worst-case stack and instructions a tick of both images, beside their goals
 	@tools/setup.sh test
