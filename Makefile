@@ -2,17 +2,19 @@
 PYTHON := .venv/bin/python
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 MAKEFLAGS += --no-print-directory
+FUZZ_SECONDS ?= 600
 # compiles the plant when its sources have changed, so that no test waits for it
-COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet
-C_FILES = find firmware tests/unit tools -name '*.[ch]' -not -path '*/generated/*'
+COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet && \
+    $(PYTHON) sil_plant/run.py --bus inproc --scenario sil_plant/scenarios/faults.toml --quiet
+C_FILES = find firmware tests/unit tests/fuzz tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images fmu budget demo paper test lint format generate clean
+.PHONY: help setup firmware images fmu budget demo paper test faults coverage fuzz fuzz-corpus lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
 	@echo
-	@awk -F ': ## ' '/^[a-z]+: ## / { printf "  %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ': ## ' '/^[a-z-]+: ## / { printf "  %-12s %s\n", $$1, $$2 }' Makefile
 
 setup: ## install what the demo and the tests need: Debian packages and .venv
 	@tools/setup.sh test
@@ -25,12 +27,6 @@ images: ## the Cortex-M images, build/cortex-m4f/diarc_ecu.elf and build/cortex-
 	@for preset in cortex-m4f cortex-m3; do \
 	    cmake --preset $$preset && cmake --build --preset $$preset --parallel $(JOBS) && \
 	    arm-none-eabi-size build/$$preset/diarc_ecu.elf || exit 1; done
-
-fmu: ## build/diarc_ecu.fmu and build/diarc_plant.fmu: the ECU and the arm for other simulation tools
-	@tools/setup.sh demo
-	@cmake --preset default -DDIARC_PYTHON=$(abspath $(PYTHON))
-	@cmake --build build --target fmu --parallel $(JOBS)
-	@$(PYTHON) tools/export_fmu.py plant -o build/diarc_plant.fmu
 
 budget: ## flash, RAM, worst-case stack and instructions a tick of both images, beside their goals
 	@tools/setup.sh test
@@ -54,6 +50,25 @@ test: ## every test: unit tests in C, then pytest
 	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
 	@$(PYTHON) -m pytest
+
+faults: ## break everything on purpose: the fault matrix, build/faults.json
+	@tools/setup.sh test
+	@$(MAKE) firmware
+	@$(PYTHON) tools/faults.py
+
+coverage: ## lines of the law and the ECU that the unit tests run: all of them, or it fails
+	@tools/setup.sh test
+	@$(PYTHON) tools/coverage.py
+
+fuzz: ## fuzz the ECU, FUZZ_SECONDS (600) for each harness; crashes go to build/fuzz, see docs/fuzzing.md
+	@tools/setup.sh test
+	@FUZZ_SECONDS=$(FUZZ_SECONDS) $(PYTHON) -m pytest tests/fuzz -k breaks_the_ecu
+
+fuzz-corpus: ## after make fuzz: put what it found into tests/fuzz/corpus, as few inputs as reach the same
+	@for corpus in tests/fuzz/corpus/*; do \
+	    name=$${corpus##*/} && rm -rf build/fuzz/merged && mkdir build/fuzz/merged && \
+	    build/fuzz/tests/fuzz_$${name}_double -merge=1 -use_counters=0 build/fuzz/merged $$corpus build/fuzz/found-$$name && \
+	    rm -rf $$corpus && mv build/fuzz/merged $$corpus || exit 1; done
 
 rules: ## MISRA C:2012: write tests/rules/misra_findings.txt and the counts in docs/misra.md
 	@tools/setup.sh test

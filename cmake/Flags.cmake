@@ -11,6 +11,14 @@ target_compile_options(diarc_flags INTERFACE
     -fno-math-errno   # a square root is one instruction
     -Wall -Wextra -Wconversion -Wshadow -Wdouble-promotion -Werror)
 
+if(DIARC_FUZZ)
+    if(NOT CMAKE_C_COMPILER_ID MATCHES "Clang")
+        message(FATAL_ERROR "DIARC_FUZZ needs clang: cmake --preset fuzz")
+    endif()
+    set(DIARC_SANITIZE ON)
+    target_compile_options(diarc_flags INTERFACE -fsanitize=fuzzer-no-link) # what an input reaches
+endif()
+
 if(DIARC_SANITIZE)
     set(sanitizers -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer)
     target_compile_options(diarc_flags INTERFACE ${sanitizers})

@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
-from sil_plant import protocol
+from sil_plant import injection, protocol
 from sil_plant.buses import FramePort
 from sil_plant.external_plant import ExternalPlant
 from sil_plant.frames import FRAME_BYTES, from_row, to_row
-from sil_plant.io_node import IO_HEARTBEAT_S, advance_one_period, heartbeat_row
+from sil_plant.io_node import advance_one_period
 from sil_plant.session import (
     DBC_HASH,
     HASH_HEARD,
@@ -22,10 +23,12 @@ from sil_plant.session import (
     REQUEST_STANDBY,
     TICK,
     Session,
+    ecu_is_dead,
     motion_frame,
     nmt_frame,
     on_frame,
     on_sync,
+    without_sync,
 )
 
 ECU_WAIT_S = 3.0
@@ -85,11 +88,22 @@ def _heard(port: FramePort, limit_s: float, wanted: Callable[[int, bytes], bool]
     return False
 
 
+class EcuPower(Protocol):
+    """What switches an ECU of ours off and on again."""
+
+    def kill(self) -> None:
+        """End it at once."""
+
+    def start(self) -> None:
+        """Start it anew."""
+
+
 def run_on_bus(
     session: Session,
     port: FramePort,
     progress: Callable[[int], None],
     alive: Callable[[], None],
+    power: EcuPower | None = None,
     plant: ExternalPlant | None = None,
 ) -> None:
     """Run the session to its end; the ECU must just have booted.
@@ -104,13 +118,16 @@ def run_on_bus(
         Told the tick now and then.
     alive : callable
         Raises when an ECU that was spawned has ended.
+    power : EcuPower or None
+        Switches the ECU off and on again, for a scenario that has it killed.
     plant : ExternalPlant, optional
         Another plant than ours.
 
     Raises
     ------
     EcuLostError
-        When SYNC stays away or the ECU boots again; the plant has closed its valves by then.
+        When SYNC stays away, or the ECU boots again and no fault of the scenario made it; the plant has closed its
+        valves by then.
     PlantLostError
         When the other plant fails.
     ConfigError
@@ -118,10 +135,7 @@ def run_on_bus(
     """
     out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     heartbeat_id = protocol.frame_id("HEARTBEAT_ECU")
-    period_s = session.timing.period_s
     check_tick = session.timeline.run_request
-    heartbeat_ticks = max(1, round(IO_HEARTBEAT_S / period_s))
-    heartbeat = from_row(heartbeat_row())
     while True:
         frame = port.receive(ECU_LOST_S)
         if frame is None:
@@ -129,24 +143,49 @@ def run_on_bus(
             alive()
             raise EcuLostError(f"the ECU fell silent for {ECU_LOST_S:g} s; the valves are closed")
         can_id, data = frame
-        if can_id == protocol.SYNC_ID and data:
+        if can_id == protocol.SYNC_ID and power is not None and session.faulty and ecu_is_dead(session):
+            sit_out_death(session, port, power, out)
+        elif can_id == protocol.SYNC_ID and data:
             tick = int(session.progress.index[TICK])
             if tick == check_tick:
                 check_hash(session)
             rows = on_sync(session, data[0], out) if plant is None else plant.on_sync(session, data[0], out)
             if rows < 0:
                 return
-            answer = [from_row(row) for row in out[:rows]]
-            if tick % heartbeat_ticks == 0:
-                answer.append(heartbeat)
-            port.send_many(answer)
+            port.send_many([from_row(row) for row in out[:rows]])
             if tick % 100 == 0:
                 progress(tick)
-        elif can_id == heartbeat_id and data == b"\0":
+        elif can_id == heartbeat_id and data == b"\0" and not reboot_expected(session):
             close_valves(session, plant)
             raise EcuLostError("the ECU restarted in the middle of the run; the valves are closed")
         elif can_id < 0x800:
             on_frame(session, to_row(can_id, data))
+
+
+def sit_out_death(session: Session, port: FramePort, power: EcuPower, out: np.ndarray) -> None:
+    """Kill the ECU, let the node go on by its own clock for as long as the fault lasts, start the ECU anew.
+
+    Raises
+    ------
+    EcuMissingError
+        When it does not boot.
+    """
+    heartbeat_id = protocol.frame_id("HEARTBEAT_ECU")
+    power.kill()  # at the SYNC that the plant no longer answers
+    port.discard_pending()
+    while ecu_is_dead(session) and without_sync(session, out) >= 0:
+        pass
+    power.start()
+    if not _heard(port, ECU_WAIT_S, lambda can_id, data: can_id == heartbeat_id and data == b"\0", lambda: None):
+        raise EcuMissingError("the ECU that was killed does not boot again; try it by hand: ./firmware/diarc_ecu")
+    on_frame(session, to_row(heartbeat_id, b"\0"))
+
+
+def reboot_expected(session: Session) -> bool:
+    """True from the first fault on that makes an ECU begin anew."""
+    plan = session.injection.plan
+    kinds = plan[plan[:, injection.FIRST] < session.progress.index[TICK], injection.KIND]
+    return bool(np.isin(kinds, (injection.NMT_RESET, injection.ECU_KILLED)).any())
 
 
 def check_hash(session: Session) -> None:
@@ -168,6 +207,9 @@ def warm_up(session: Session) -> None:
     on_sync(session, 6, out)
     for row in out[:1]:
         on_frame(session, to_row(*from_row(row)))
+    if session.faulty:
+        without_sync(session, out)
+        ecu_is_dead(session)
     motion_frame(0, REQUEST_STANDBY)
     close_valves(session)
 

@@ -61,6 +61,8 @@ _CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _ARPHRD_CAN, _IFF_UP = 280, 1
 _SIOCGIFFLAGS, _SIOCGIFHWADDR = 0x8913, 0x8927
 _SO_MEMINFO, _MEMINFO_DROPS = 55, 8
+_SO_RCVBUFFORCE = 33
+_AF_CAN = getattr(socket, "AF_CAN", None)
 _SEND_LIMIT_S = 0.1  # how long to wait for room in a full transmit queue
 _SEND_PAUSE_S = 0.0002  # between attempts: about two frames at 1 Mbit/s
 _DISCARD_LIMIT_S = 0.25
@@ -347,8 +349,7 @@ class SocketCanPort(FramePort):
         self.name = address.channel
         self._bus = _open_socketcan(address, can_filters=filters, ignore_rx_error_frames=True)
         self._sock: socket.socket = self._bus.socket  # type: ignore[attr-defined]
-        with contextlib.suppress(OSError):  # the default holds some 270 frames; the kernel grants what it may
-            self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        _enlarge_buffer(self._sock)
         self._poll = select.poll()
         self._poll.register(self._sock, select.POLLIN)
         self._closed = False
@@ -409,17 +410,30 @@ class SocketCanPort(FramePort):
     @property
     def receive_drops(self) -> int:
         """Frames the kernel threw away because this process read too slowly."""
-        try:
-            info = self._sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
-            return int(struct.unpack_from("=I", info, 4 * _MEMINFO_DROPS)[0])
-        except (OSError, struct.error):
-            return 0
+        return _kernel_drops(self._sock)
 
     def close(self) -> None:
         """Leave the bus."""
         if not self._closed:
             self._closed = True
             self._bus.shutdown()
+
+
+def _enlarge_buffer(sock: socket.socket) -> None:
+    """Ask for room for 2 s of frames; the default has it for 50 ms, and without rights the kernel grants 100 ms."""
+    for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):
+        with contextlib.suppress(OSError):
+            sock.setsockopt(socket.SOL_SOCKET, option, 4 << 20)
+            return
+
+
+def _kernel_drops(sock: socket.socket) -> int:
+    """Frames that the kernel threw away because nobody read them in time."""
+    try:
+        info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+        return int(struct.unpack_from("=I", info, 4 * _MEMINFO_DROPS)[0])
+    except (OSError, struct.error):
+        return 0
 
 
 def _open_socketcan(address: BusAddress, **options: object) -> can.BusABC:
@@ -599,6 +613,9 @@ class PythonCanPort(FramePort):
         self._errors = (can.CanError, OSError)
         tcp = getattr(bus, "_SocketCanDaemonBus__socket", None)
         self._tcp: socket.socket | None = tcp if isinstance(tcp, socket.socket) else None
+        sock = getattr(bus, "socket", None)
+        if isinstance(sock, socket.socket) and sock.family == _AF_CAN:
+            _enlarge_buffer(sock)
         self._closed = False
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -614,14 +631,8 @@ class PythonCanPort(FramePort):
         """Next frame, or None when the time is over."""
         end = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
-            left = self._SLICE_S if end is None else min(self._SLICE_S, max(0.0, end - time.monotonic()))
-            try:
-                message = self.bus.recv(left)
-            except self._errors as error:
-                raise self._lost(error) from error
+            message = self.receive_message(self._SLICE_S if end is None else max(0.0, end - time.monotonic()))
             if message is None:
-                if self._hub_gone():
-                    raise BusError(f"{self.name}: the hub closed the connection; start it again, then this")
                 if end is not None and time.monotonic() >= end:
                     return None
             elif message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd:
@@ -629,6 +640,22 @@ class PythonCanPort(FramePort):
             else:
                 self.received += 1
                 return message.arbitration_id, bytes(message.data)
+
+    def receive_message(self, timeout_s: float) -> can.Message | None:
+        """Next message of any kind, with its time, or None when the time, or a slice of it, is over."""
+        try:
+            message = self.bus.recv(min(self._SLICE_S, timeout_s))
+        except self._errors as error:
+            raise self._lost(error) from error
+        if message is None and self._hub_gone():
+            raise BusError(f"{self.name}: the hub closed the connection; start it again, then this")
+        return message
+
+    @property
+    def receive_drops(self) -> int:
+        """Frames the kernel threw away because this process read too slowly."""
+        sock = getattr(self.bus, "socket", None)
+        return _kernel_drops(sock) if isinstance(sock, socket.socket) and sock.family == _AF_CAN else 0
 
     def _hub_gone(self) -> bool:
         if self._tcp is None:

@@ -14,7 +14,8 @@ from sil_plant import bus_run, inproc, session
 from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.environment import say
-from sil_plant.external_plant import ExternalPlant, warm_up
+from sil_plant.external_plant import ExternalPlant
+from sil_plant.faults import Fault
 from sil_plant.machine import Machine
 from sil_plant.scenario import Scenario, with_load
 
@@ -40,8 +41,17 @@ class SpawnedEcu:
     def __init__(self, bus: str, pace: str, params: Path) -> None:
         if not ECU_BINARY.exists():
             raise ConfigError(f"{ECU_BINARY.relative_to(ROOT)} is not built; build it: make firmware")
-        command = [str(ECU_BINARY), bus, "--pace", pace, "--quiet", "--params", str(params)]
-        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        self.command = [str(ECU_BINARY), bus, "--pace", pace, "--quiet", "--params", str(params)]
+        self.start()
+
+    def start(self) -> None:
+        """Start the process; again after a :meth:`kill`."""
+        self.process = subprocess.Popen(self.command, stdin=subprocess.DEVNULL)
+
+    def kill(self) -> None:
+        """End the process as a loss of power would."""
+        self.process.kill()
+        self.process.wait()
 
     def check(self) -> None:
         """Raise when the process has ended."""
@@ -60,8 +70,8 @@ class SpawnedEcu:
             self.process.wait()
 
 
-def compile_plant(machine: Machine, scenario: Scenario, external: bool = False) -> None:
-    """Run a few ticks in memory, so that no compiling happens while a bus waits; ``external``: for another plant.
+def compile_plant(machine: Machine, scenario: Scenario) -> None:
+    """Run a few ticks in memory, so that no compiling happens while a bus waits.
 
     Raises
     ------
@@ -70,8 +80,8 @@ def compile_plant(machine: Machine, scenario: Scenario, external: bool = False) 
     """
     from numba.core import config
 
-    entry = "session.answer_sync" if external else "session.on_sync"
-    if not any(Path(config.CACHE_DIR).glob(f"**/{entry}*.nbi")):
+    compiled = "on_sync_with_faults" if scenario.faults else "on_sync_plain"
+    if not any(Path(config.CACHE_DIR).glob(f"**/session.{compiled}*.nbi")):
         say("compiling the plant, once after installation (about 20 s) ...")
     short = with_load(replace(scenario, duration_s=0.01), 0.0)
     try:
@@ -80,8 +90,6 @@ def compile_plant(machine: Machine, scenario: Scenario, external: bool = False) 
         raise ConfigError(str(error)) from error
     inproc.run_inproc(warm, inproc.InprocEcu(period_us=PERIOD_US), 5)
     bus_run.warm_up(warm)
-    if external:
-        warm_up(warm)
 
 
 def in_process(
@@ -141,6 +149,7 @@ def over_bus(
             if not quiet and pace is None:
                 say(f"CAN over TCP at {bus}; start the ECU: ./firmware/diarc_ecu {bus}")
         alive: Callable[[], None] = _always
+        ecu = None
         if pace is not None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="diarc-"))
             params = Path(folder) / "machine.params"
@@ -152,7 +161,7 @@ def over_bus(
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
         try:
-            bus_run.run_on_bus(run, port, progress, alive, plant)
+            bus_run.run_on_bus(run, port, progress, alive, ecu, plant)
         except BusError as error:
             bus_run.close_valves(run, plant)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
@@ -163,14 +172,31 @@ def _always() -> None:
     """An ECU that is not ours is watched through its frames alone."""
 
 
+def check_faults(faults: tuple[Fault, ...], in_process: bool, spawned: bool) -> None:
+    """Refuse faults that this way of running cannot inject.
+
+    Raises
+    ------
+    ConfigError
+        Saying which way can.
+    """
+    for fault in faults:
+        if fault.kind == "send_queue_full" and not in_process:
+            raise ConfigError("send_queue_full is the in-process driver's fault: --bus inproc")
+        if fault.kind == "ecu_killed" and not in_process and not spawned:
+            raise ConfigError("ecu_killed needs an ECU that run.py may kill: --ecu spawn, or --bus inproc")
+
+
 def outcome(run: session.Session) -> str | None:
-    """What went wrong in a run that reached its end, or None."""
+    """What went wrong in a run that reached its end, or None. With faults on purpose, only how it ended counts."""
     whole = run.monitor.whole
-    if whole[session.FAULTED]:
+    on_purpose = len(run.injection.plan) > 0
+    if whole[session.FAULTED] and not on_purpose:
         return f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
     if whole[session.MODE] != session.MODE_RUN:
         mode = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
-        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]})"
-    if whole[session.REFUSED]:
+        fault = f", fault {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h" if on_purpose else ""
+        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]}{fault})"
+    if whole[session.REFUSED] and not on_purpose:
         return f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
     return None

@@ -20,11 +20,10 @@ import numpy as np
 from sil_plant import io_node
 from sil_plant.config import ConfigError
 from sil_plant.fmu_map import CHAMBERS, JOINTS, STATE_KEYS, PlantMap, Signal, bind, load_map
-from sil_plant.frames import FRAME_BYTES
 from sil_plant.io_node import NodeErrors, NodeTiming
 from sil_plant.plant import STATES, XV
 from sil_plant.scenario import Scenario
-from sil_plant.session import OUT_ROWS, TICK, Session, answer_sync, begin_sync, is_parked
+from sil_plant.session import SYNC_COUNTERS, TICK, Session, load_due, on_sync_plain
 
 FMI_VERSIONS = ("2.0", "3.0")
 START_WITHIN_RAD = 0.01  # of the pose that was asked for
@@ -103,6 +102,7 @@ class ExternalPlant:
         self._step_s = _communication_step(self.model, session.timing, session.errors, self.path)
         self._folder = tempfile.mkdtemp(prefix="diarc-fmu-")
         node = session.node
+        node.count[io_node.EXTERNAL] = 1
         try:
             fmpy.extract(str(self.path), unzipdir=self._folder)
             self._fmu = instantiate_fmu(self._folder, self.model, "CoSimulation", logger=self._log, debug_logging=True)
@@ -152,20 +152,21 @@ class ExternalPlant:
 
     def on_sync(self, session: Session, sync_counter: int, out: np.ndarray) -> int:
         """As :func:`sil_plant.session.on_sync`, with the FMU for a plant."""
-        go_on = begin_sync(session, sync_counter)
-        if go_on <= 0:
-            return int(go_on)
-        tick = int(session.progress.index[TICK])
+        tick, node = int(session.progress.index[TICK]), session.node
+        if tick >= session.noise.shape[0]:
+            return -1
+        load_due(session, tick)
         if self.map.load_constant_kg is not None:
-            session.node.load[0] = self.map.load_constant_kg
-        for _ in range(io_node.periods_due(session.node, sync_counter)):
-            if not is_parked(session):
+            node.load[0] = self.map.load_constant_kg
+        last = int(node.count[io_node.SYNC_LAST])
+        for _ in range((sync_counter - last) % SYNC_COUNTERS if last else 0):
+            if tick >= session.timeline.parked:
                 self.advance_one_period(session, session.noise[tick, 7])
-        rows = answer_sync(session, sync_counter, out)
+        rows = int(on_sync_plain(session, sync_counter, out))
         session.record.state[tick, self._absent] = np.nan
         if not any(key.startswith("load.") for key in self.signals) and self.map.load_constant_kg is None:
             session.record.load_true[tick] = np.nan
-        return int(rows)
+        return rows
 
     def advance_one_period(self, session: Session, jitter: float) -> None:
         """From one SYNC to the next: the old set-points up to the delay, then the new ones.
@@ -254,17 +255,6 @@ class ExternalPlant:
     def _reason(self, error: Exception) -> str:
         said = "; ".join(self._said)
         return f"{error}" + (f" it says: {said}" if said else "")
-
-
-def warm_up(session: Session) -> None:
-    """Compile what a run with another plant calls, with a session that is thrown away afterwards."""
-    out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
-    begin_sync(session, 7)
-    io_node.periods_due(session.node, 7)
-    is_parked(session)
-    io_node.command_delay(session.timing, session.errors, 0.0)
-    io_node.take_command(session.node, session.timing, session.errors)
-    answer_sync(session, 7, out)
 
 
 def _describe(fmu: Path) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 
+import numba.experimental.function_type  # noqa: F401  without it numba does not know _CFunction before its first compiling
 import numpy as np
 from numba import njit, types
 from numba.types import WrapperAddressProtocol
@@ -13,7 +14,19 @@ from sil_plant.config import ROOT, ConfigError
 from sil_plant.external_plant import ExternalPlant
 from sil_plant.frames import DATA, FRAME_BYTES, frame_id
 from sil_plant.protocol import SYNC_ID
-from sil_plant.session import OUT_ROWS, Session, on_frame, on_sync
+from sil_plant.session import (
+    OUT_ROWS,
+    TICK,
+    Session,
+    ecu_is_dead,
+    on_frame_plain,
+    on_frame_with_faults,
+    on_sync_plain,
+    on_sync_with_faults,
+    restarts,
+    transmit_room,
+    without_sync,
+)
 
 LIBRARIES = ROOT / "build" / "lib"
 SCALARS = ("double", "float", "fixed")
@@ -61,16 +74,22 @@ class InprocEcu:
         size = self.library.diarc_inproc_size()
         self.memory = np.zeros(size + 64, dtype=np.uint8)
         self.pointer = (self.memory.ctypes.data + 63) & ~63
+        self._image, self._period_us = image, period_us
+        self.begin = _CFunction(ctypes.cast(self.library.diarc_inproc_begin, ctypes.c_void_p).value or 0, _BEGIN)
+        self.end = _CFunction(ctypes.cast(self.library.diarc_inproc_end, ctypes.c_void_p).value or 0, _END)
+        self.restart()
+
+    def restart(self) -> None:
+        """Switch it off and on again: nothing is left but its parameters."""
+        image = self._image
         entry = ctypes.c_uint16()
         status = self.library.diarc_inproc_init(
-            self.pointer, image, len(image) if image else 0, period_us, ctypes.byref(entry)
+            self.pointer, image, len(image) if image else 0, self._period_us, ctypes.byref(entry)
         )
         if status != 0:
             text = self.library.diarc_inproc_status_text(status).decode()
             name = self.library.diarc_inproc_parameter_name(entry.value).decode()
             raise ConfigError(f"the firmware refuses its parameters: the image {text} (parameter {name})")
-        self.begin = _CFunction(ctypes.cast(self.library.diarc_inproc_begin, ctypes.c_void_p).value or 0, _BEGIN)
-        self.end = _CFunction(ctypes.cast(self.library.diarc_inproc_end, ctypes.c_void_p).value or 0, _END)
 
     def tick_begin(self) -> np.ndarray:
         """First half of a tick; the frames sent, shape (n, 16)."""
@@ -83,6 +102,16 @@ class InprocEcu:
         rx = np.ascontiguousarray(rows, dtype=np.uint8)
         tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
         sent = self.library.diarc_inproc_end(self.pointer, rx.ctypes.data, len(rx), tx.ctypes.data, TX_ROWS)
+        return tx[:sent]
+
+    def request_safe_stop(self) -> None:
+        """What its port does, between ticks, when it is told to end."""
+        self.library.diarc_inproc_request_safe_stop(self.pointer)
+
+    def shutdown(self) -> np.ndarray:
+        """Shut the valves at once; the frames sent."""
+        tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
+        sent = self.library.diarc_inproc_shutdown(self.pointer, tx.ctypes.data, TX_ROWS)
         return tx[:sent]
 
 
@@ -111,6 +140,9 @@ def _load(path: Path) -> ctypes.CDLL:
         ctypes.c_void_p,
         ctypes.c_int32,
     )
+    library.diarc_inproc_request_safe_stop.argtypes = (ctypes.c_void_p,)
+    library.diarc_inproc_request_safe_stop.restype = None
+    library.diarc_inproc_shutdown.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int32)
     return library
 
 
@@ -124,24 +156,67 @@ def closed_loop(
         rows = 0
         for k in range(sent):
             if frame_id(tx[k]) == SYNC_ID:
-                rows = on_sync(session, int(tx[k, 5]), rx)
+                rows = on_sync_plain(session, int(tx[k, 5]), rx)
             else:
-                on_frame(session, tx[k])
+                on_frame_plain(session, tx[k])
         if rows < 0:
             return done
         sent = end(ecu, np.uintp(rx.ctypes.data), np.int32(rows), np.uintp(tx.ctypes.data), np.int32(TX_ROWS))
         for k in range(sent):
-            on_frame(session, tx[k])
+            on_frame_plain(session, tx[k])
+    return ticks
+
+
+@njit(cache=True)
+def closed_loop_with_faults(
+    session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
+) -> int:
+    """As :func:`closed_loop`, with an ECU that may be dead, or unable to send."""
+    for done in range(ticks):
+        if ecu_is_dead(session):
+            if without_sync(session, rx) < 0:
+                return done
+            continue
+        room = transmit_room(session, TX_ROWS)
+        sent = begin(ecu, np.uintp(tx.ctypes.data), np.int32(room))
+        room -= sent
+        rows = 0
+        synchronous = False
+        for k in range(sent):
+            if frame_id(tx[k]) == SYNC_ID:
+                rows = on_sync_with_faults(session, int(tx[k, 5]), rx)
+                synchronous = True
+            else:
+                on_frame_with_faults(session, tx[k])
+        if not synchronous:
+            rows = without_sync(session, rx)
+        if rows < 0:
+            return done
+        sent = end(ecu, np.uintp(rx.ctypes.data), np.int32(rows), np.uintp(tx.ctypes.data), np.int32(room))
+        for k in range(sent):
+            on_frame_with_faults(session, tx[k])
     return ticks
 
 
 def run_inproc(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant | None = None) -> int:
-    """Run at most ``ticks`` ticks, with another plant than ours if one is given; the number done."""
+    """Run at most ``ticks`` ticks, with another plant than ours if one is given; the number done.
+
+    An ECU that a fault kills starts anew here.
+    """
     if plant is not None:
         return _run_external(session, ecu, ticks, plant)
     rx = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
-    return int(closed_loop(session, ecu.begin, ecu.end, np.uintp(ecu.pointer), ticks, rx, tx))
+    first = int(session.progress.index[TICK])
+    done = 0
+    for stop in [tick - first for tick in restarts(session) if first < tick <= first + ticks] + [ticks]:
+        loop = closed_loop_with_faults if session.faulty else closed_loop
+        done += int(loop(session, ecu.begin, ecu.end, np.uintp(ecu.pointer), stop - done, rx, tx))
+        if done < stop:
+            break
+        if first + stop in restarts(session):
+            ecu.restart()
+    return done
 
 
 def _run_external(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant) -> int:
@@ -153,9 +228,9 @@ def _run_external(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalP
             if frame_id(row) == SYNC_ID:
                 rows = plant.on_sync(session, int(row[DATA]), out)
             else:
-                on_frame(session, row)
+                on_frame_plain(session, row)
         if rows < 0:
             return done
         for row in ecu.tick_end(out[:rows]):
-            on_frame(session, row)
+            on_frame_plain(session, row)
     return ticks

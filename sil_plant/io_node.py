@@ -24,8 +24,8 @@ _ANGLE_LIMIT = 8388607
 _PRESSURE_LIMIT = 65534  # 65535 means invalid
 _SPOOL_LIMIT = 32767
 
-# Places in Node.count
-TICK, SYNC_LAST, SYNC_LOST, COMMAND_AGE, COMMAND_NEW, E2E_REFUSED, VALVE_COUNTER, TIMED_OUT = range(8)
+# Places in Node.count; EXTERNAL: the plant is another one than ours, and its owner moves it on
+TICK, SYNC_LAST, SYNC_LOST, COMMAND_AGE, COMMAND_NEW, E2E_REFUSED, VALVE_COUNTER, TIMED_OUT, EXTERNAL = range(9)
 
 
 class NodeLayout(NamedTuple):
@@ -41,6 +41,7 @@ class NodeLayout(NamedTuple):
     pressure_step: float
     spool_step: float
     command_step: float
+    heartbeat_id: int
 
 
 class NodeErrors(NamedTuple):
@@ -60,6 +61,7 @@ class NodeTiming(NamedTuple):
     period_s: float
     delay_s: float
     timeout_ticks: int
+    heartbeat_ticks: int
 
 
 class Node(NamedTuple):
@@ -103,6 +105,7 @@ def node_layout() -> NodeLayout:
         pressure_step=protocol.scale("PRESSURES_SWING", "BorePressure") * 1e5,
         spool_step=protocol.scale("PRESSURES_SWING", "SpoolPosition") / 100.0,
         command_step=protocol.scale("VALVES", "SwingSpool") / 100.0,
+        heartbeat_id=protocol.frame_id("HEARTBEAT_IO"),
     )
 
 
@@ -120,9 +123,11 @@ def node_errors(machine: Machine) -> NodeErrors:
     )
 
 
-def heartbeat_row() -> np.ndarray:
-    """The node's heartbeat frame."""
-    return frames.to_row(protocol.frame_id("HEARTBEAT_IO"), bytes((_NMT_OPERATIONAL,)))
+@njit(cache=True)
+def node_heartbeat(layout: NodeLayout, row: np.ndarray) -> None:
+    """Make a row the node's heartbeat."""
+    write_header(row, layout.heartbeat_id, 1)
+    row[frames.DATA] = _NMT_OPERATIONAL
 
 
 def node_timing(machine: Machine, period_s: float) -> NodeTiming:
@@ -131,12 +136,13 @@ def node_timing(machine: Machine, period_s: float) -> NodeTiming:
         period_s=period_s,
         delay_s=min(machine["io.command_delay_s"], period_s),
         timeout_ticks=max(1, round(machine["io.valve_timeout_s"] / period_s)),
+        heartbeat_ticks=max(1, round(IO_HEARTBEAT_S / period_s)),
     )
 
 
 def make_node(y: np.ndarray, load_kg: float) -> Node:
     """A node at rest that has heard nothing yet."""
-    count = np.zeros(8, dtype=np.int64)
+    count = np.zeros(9, dtype=np.int64)
     count[VALVE_COUNTER] = -1
     return Node(
         y=y.copy(),
@@ -192,6 +198,8 @@ def advance_one_period(
     jitter : float
         -1..1, how far the delay is off in this period, in units of the jitter.
     """
+    if node.count[EXTERNAL]:
+        return  # sil_plant/external_plant.py has done it
     delay_s = command_delay(timing, errors, jitter)
     integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
     take_command(node, timing, errors)
@@ -199,39 +207,27 @@ def advance_one_period(
 
 
 @njit(cache=True)
-def periods_due(node: Node, sync_counter: int) -> int:
-    """Periods from the SYNC before to this one, 0 at the first; ones that went missing are counted."""
-    count = node.count
-    periods = 0
-    if count[SYNC_LAST] > 0:
-        periods = (sync_counter - count[SYNC_LAST]) % 240
-        count[SYNC_LOST] += periods - 1
-        count[TICK] += periods
-    count[SYNC_LAST] = sync_counter
-    return periods
-
-
-@njit(cache=True)
-def node_sample(
+def node_sync(
     node: Node,
     plant: PlantParameters,
     layout: NodeLayout,
+    timing: NodeTiming,
     errors: NodeErrors,
     parked: bool,
     sync_counter: int,
     noise: np.ndarray,
     out: np.ndarray,
 ) -> int:
-    """Sample the plant as it is now and pack the sensor frames.
+    """Answer SYNC: bring the plant to this instant, sample, and pack the sensor frames.
 
     Parameters
     ----------
-    node, plant, layout, errors
+    node, plant, layout, timing, errors
         The node.
     parked : bool
-        The pump is off: all chambers are at tank pressure.
+        The pump is off and the arm rests on its support: nothing moves, all chambers are at tank pressure.
     sync_counter : int
-        1..240.
+        1..240; missing ones are integrated over and counted.
     noise : np.ndarray
         This tick's noise, shape (12,): two angles (rad), four pressures (Pa), sampling and delay jitter (-1..1),
         and for three sensor frames and the valve frame a number in 0..1 that decides whether it is lost.
@@ -243,6 +239,16 @@ def node_sample(
     int
         Rows written: three, less those that the bus loses.
     """
+    count = node.count
+    if count[SYNC_LAST] > 0:
+        periods = (sync_counter - count[SYNC_LAST]) % 240
+        count[SYNC_LOST] += periods - 1
+        for _ in range(periods):
+            if not parked:
+                advance_one_period(node, plant, timing, errors, noise[7])
+        count[TICK] += periods
+    count[SYNC_LAST] = sync_counter
+
     # The E2E counter of a sensor frame says which SYNC it answers.
     counter = (sync_counter - 1) % E2E_STATES
     y = node.y

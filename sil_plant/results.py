@@ -10,8 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
+from sil_plant import protocol
 from sil_plant.config import ConfigError
-from sil_plant.session import LOST, MODE_NAMES, TICK, Record, Session, Timeline, sync_lost, trace_sha256
+from sil_plant.faults import Fault
+from sil_plant.session import (
+    EMERGENCIES,
+    LOST,
+    MODE_NAMES,
+    TICK,
+    Record,
+    Session,
+    Timeline,
+    sync_lost,
+    trace_sha256,
+)
 
 LOAD_BAND_KG = 0.1
 AFTER_S = 1.0
@@ -164,6 +176,42 @@ def table(result: Result, bus_load: float) -> str:
             f"{result.realtime_factor:.1f} times real time",
         ]
     )
+
+
+@dataclass(frozen=True)
+class Emergency:
+    """One emergency frame of the ECU."""
+
+    tick: int
+    code: int
+    fault: str  # its name in the DBC
+
+
+def _fault_choices() -> dict[int, str]:
+    signal = protocol.database().get_message_by_name("TIMING").get_signal_by_name("FaultCode")
+    return {int(code): str(name) for code, name in (signal.choices or {}).items()}
+
+
+def fault_names() -> set[str]:
+    """Names of the ECU's faults in the DBC."""
+    return set(_fault_choices().values())
+
+
+def emergencies(session: Session) -> list[Emergency]:
+    """Every emergency frame of a run; error code 0: the fault is over."""
+    names = _fault_choices()
+    rows = session.record.emergency[: session.monitor.whole[EMERGENCIES]].tolist()
+    return [Emergency(tick, code, names.get(fault, str(fault))) for tick, code, fault in rows]
+
+
+def fault_lines(session: Session, faults: tuple[Fault, ...]) -> list[str]:
+    """What was broken on purpose and what the ECU said, for the table."""
+    zero, period_s = session.timeline.motion, session.timeline.period_s
+    lines = [f"  {'fault' if n else 'faults':17} {fault.text()}" for n, fault in enumerate(faults)]
+    for emergency in emergencies(session) if faults else []:
+        what = f"{emergency.fault}, {emergency.code:04X}h" if emergency.code else "over"
+        lines.append(f"  emergency         {(emergency.tick - zero) * period_s:.3f} s: {what}")
+    return lines
 
 
 def check_writable(path: Path) -> None:

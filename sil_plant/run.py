@@ -122,6 +122,7 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
             raise ConfigError(f"--seed {arguments.seed}: a whole number from 0 to 2^63 - 1 is needed")
         scenario = replace(scenario, seed=arguments.seed)
     check_scenario(scenario, machine)
+    execution.check_faults(scenario.faults, address.kind == "inproc", arguments.ecu == "spawn")
     plant_machine = with_changes(machine, profile.effects, f"profile {profile.name}: [effects]")
     plant_machine = with_changes(plant_machine, scenario.plant, f"{arguments.scenario}: [plant]")
     for path in (arguments.json, arguments.csv):
@@ -129,6 +130,8 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
             results.check_writable(path)
     plant = None
     if arguments.fmu is not None:
+        if scenario.faults:
+            raise ConfigError("--fmu: the faults of a scenario are for our own plant; choose a scenario without any")
         plant = ExternalPlant(arguments.fmu, arguments.map)
         for note in plant.notes(scenario, profile.name == "paper"):
             if not arguments.quiet:
@@ -136,11 +139,11 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     return Inputs(machine, plant_machine, scenario, profile.tare, address, plant)
 
 
-def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run) -> bool:
+def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run, faults: list[str]) -> bool:
     """Print the table and write what was recorded; one file that fails does not cost the others."""
     result = results.summarise(record, run)
     if not arguments.quiet:
-        show(results.table(result, protocol.worst_case_bus_load()))
+        show("\n".join([results.table(result, protocol.worst_case_bus_load()), *faults]))
     written = True
     for path, write in (
         (arguments.json, lambda path: results.write_json(path, result)),
@@ -168,7 +171,7 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
     try:
         inputs = load_inputs(arguments)
         machine, scenario = inputs.machine, inputs.scenario
-        execution.compile_plant(machine, scenario, inputs.plant is not None)
+        execution.compile_plant(machine, scenario)
         period_s = execution.PERIOD_US * 1e-6
         try:
             run = session.make_session(
@@ -228,12 +231,12 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
             arguments.bus,
             time.perf_counter() - start if wall_s is None else wall_s,
         )
-        if not write_outputs(arguments, run.record, figures):
+        if not write_outputs(arguments, run.record, figures, results.fault_lines(run, scenario.faults)):
             status = status or EXIT_WRONG_USE
     if problem:
         say(f"run.py: {problem}")
     late = int(run.monitor.whole[session.LATE])
-    if late and not arguments.quiet and not run.errors.frame_loss:
+    if late and not arguments.quiet and not run.errors.frame_loss and not scenario.faults:
         say(
             f"run.py: note: {late} ticks ended without all sensor frames, because this machine paused the plant for "
             "longer than the ECU waits; the trace differs from an undisturbed run's"

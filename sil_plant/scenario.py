@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from sil_plant.config import ROOT, ConfigError, TomlFile, flatten
+from sil_plant.faults import Fault, outside_run, read_faults
 from sil_plant.machine import JOINT_NAMES, Machine
 
 SCENARIOS = ROOT / "sil_plant" / "scenarios"
@@ -59,7 +59,7 @@ class Scenario:
     plant : dict
         Dotted keys of the machine file, and the plant's values in their place.
     faults : tuple
-        Kept for a later version.
+        What breaks on purpose, and when.
     source : TomlFile or None
         Where it was read from, for messages.
     """
@@ -72,7 +72,7 @@ class Scenario:
     repeat: bool
     load: tuple[LoadStep, ...]
     plant: dict[str, float] = field(default_factory=dict)
-    faults: tuple[dict[str, Any], ...] = ()
+    faults: tuple[Fault, ...] = ()
     source: TomlFile | None = None
 
 
@@ -102,11 +102,6 @@ def load_scenario(path: Path) -> Scenario:
     repeat = data.get("repeat", False)
     if not isinstance(repeat, bool):
         raise toml.error("repeat", "true or false is needed")
-    faults = data.get("faults", [])
-    if not isinstance(faults, list) or not all(isinstance(fault, dict) for fault in faults):
-        raise toml.error("faults", "a list of tables [[faults]] is needed")
-    if faults:
-        raise toml.error("faults", "this version injects no faults yet; leave the list empty")
     name = data.get("name", path.stem)
     if not isinstance(name, str):
         raise toml.error("name", "a text is needed")
@@ -125,7 +120,7 @@ def load_scenario(path: Path) -> Scenario:
         repeat=repeat,
         load=_load_steps(toml),
         plant={key: toml.number(f"plant.{key}", value, -1e12, 1e12) for key, value in flatten(plant)},
-        faults=tuple(faults),
+        faults=read_faults(toml),
         source=toml,
     )
 
@@ -181,7 +176,7 @@ def with_load(scenario: Scenario, load_kg: float) -> Scenario:
 
 
 def check_scenario(scenario: Scenario, machine: Machine) -> None:
-    """Check what only the machine can tell: poses and targets inside the joint range, loads the ECU can know.
+    """Check what only machine and run can tell: targets in the joint range, loads the ECU can know, faults in the run.
 
     Raises
     ------
@@ -203,6 +198,9 @@ def check_scenario(scenario: Scenario, machine: Machine) -> None:
                 f"a load of {step.load_kg:g} kg is outside 0 to {highest:g} kg, "
                 f"the range of {machine.name} (estimator.prior.m_t_kg.high)"
             )
+    if (outside := outside_run(scenario.faults, scenario.duration_s)) is not None:
+        n, what = outside
+        raise scenario.source.error("faults.start_s", what, n) if scenario.source else ConfigError(what)
 
 
 def moves(scenario: Scenario) -> list[tuple[float, int, Segment]]:

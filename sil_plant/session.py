@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sil_plant import protocol
-from sil_plant.frames import DATA, FRAME_BYTES, frame_id, get, intact, protect, put, quantise, to_row
+from sil_plant import injection, protocol
+from sil_plant.frames import DATA, E2E_STATES, FRAME_BYTES, frame_id, get, intact, protect, put, quantise, to_row
+from sil_plant.injection import Injection
 from sil_plant.io_node import (
-    SENSOR_FRAMES,
+    COMMAND_NEW,
     SYNC_LAST,
     SYNC_LOST,
     Node,
@@ -26,10 +27,10 @@ from sil_plant.io_node import (
     make_node,
     node_errors,
     node_frame,
+    node_heartbeat,
     node_layout,
-    node_sample,
+    node_sync,
     node_timing,
-    periods_due,
 )
 from sil_plant.machine import Machine
 from sil_plant.plant import STATES, PlantParameters, plant_parameters, state_at_rest
@@ -42,9 +43,19 @@ PARKED_S = 0.25  # with the pump off, where the pressures are tared
 CONTROLLERS = ("pid", "diarc-noload", "diarc")
 
 ECU_NODE, IO_NODE = 1, 2
-NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129
-REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE, REQUEST_TARE = 1, 2, 3, 5
-MODE_NAMES = {0: "INIT", 1: "STANDBY", 2: "RUN", 3: "TARE", 15: "FAULT"}
+NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129  # commands
+NMT_STOPPED, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 4, 5, 127  # states
+REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE, REQUEST_RESET_FAULT, REQUEST_TARE = 1, 2, 3, 4, 5
+MODE_NAMES = {
+    0: "INIT",
+    1: "STANDBY",
+    2: "RUN",
+    3: "TARE",
+    4: "COMMISSION",
+    5: "HOLD",
+    6: "SAFE_STOP",
+    15: "FAULT",
+}
 # Estimated parameters in the order of the PARAMETERS frame: signal, and prior in a machine file.
 THETA = (
     ("m_t", "m_t_kg"),
@@ -62,10 +73,13 @@ THETA = (
     ("Om2_wrist", "Om2_wrist_m3_s"),
     ("Om3_wrist", "Om3_wrist_m3_s"),
 )
-MODE_RUN, MODE_FAULT = 2, 15
+MODE_INIT, MODE_STANDBY, MODE_RUN, MODE_COMMISSION, MODE_HOLD, MODE_FAULT = 0, 1, 2, 4, 5, 15
 
 MASTER_FRAMES_MOST = 4
-OUT_ROWS = SENSOR_FRAMES + MASTER_FRAMES_MOST + 1
+OUT_ROWS = 64  # three sensor frames, the master's, a heartbeat; and with faults repeated, late and foreign ones
+EMERGENCIES_MOST = 64  # recorded in a run
+RECOVER_EVERY_TICKS = 20  # the master's pace when it brings the ECU back to RUN
+RECOVER_TICKS_MOST = 2000  # then it gives up
 
 # Places in Monitor.whole
 (
@@ -81,7 +95,11 @@ OUT_ROWS = SENSOR_FRAMES + MASTER_FRAMES_MOST + 1
     EMERGENCY,
     LATE,
     FAULTED,
-) = range(12)
+    EMERGENCIES,
+    REBOOTS,
+    OUTSIDE,
+    NMT_STATE,
+) = range(16)
 
 
 class Timeline(NamedTuple):
@@ -101,6 +119,7 @@ class MonitorLayout(NamedTuple):
     timing_id: int
     emergency_id: int
     valves_id: int
+    heartbeat_id: int
     estimate: np.ndarray
     tracking: np.ndarray
     timing: np.ndarray
@@ -120,6 +139,7 @@ class Monitor(NamedTuple):
     whole: np.ndarray  # int64, places above
     load: np.ndarray  # estimate and its standard deviation, kg
     reference: np.ndarray  # swing, wrist, rad
+    sent: np.ndarray  # spool set-points, 0 when disabled
     theta: np.ndarray  # (14,), SI, nan until heard; order of THETA
     theta_sd: np.ndarray
 
@@ -147,6 +167,8 @@ class Record(NamedTuple):
     load_est: np.ndarray
     load_sd: np.ndarray
     mode: np.ndarray
+    valves: np.ndarray  # (ticks, 4), spool set-points in effect since the tick before; last sent, 0 when disabled
+    emergency: np.ndarray  # (EMERGENCIES_MOST, 3): tick, error code, fault code; whole[EMERGENCIES] of them
 
 
 class Progress(NamedTuple):
@@ -171,9 +193,13 @@ class Session(NamedTuple):
     progress: Progress
     record: Record
     noise: np.ndarray
+    injection: Injection
+    faulty: bool  # the injection has rows; a scalar, because looking into a tuple of arrays takes time
 
 
 TICK, NEXT_FRAME, NEXT_MOVE, NEXT_LOAD = range(4)
+SYNC_COUNTERS = 240  # CiA 301, 1019h
+VALVE_ACTIVE = 7  # CiA 408
 
 
 def monitor_layout() -> MonitorLayout:
@@ -184,6 +210,7 @@ def monitor_layout() -> MonitorLayout:
         timing_id=protocol.frame_id("TIMING"),
         emergency_id=protocol.frame_id("EMCY_ECU"),
         valves_id=protocol.frame_id("VALVES"),
+        heartbeat_id=protocol.frame_id("HEARTBEAT_ECU"),
         estimate=protocol.layout("ESTIMATE", ("Load", "LoadSd", "Mode")),
         tracking=protocol.layout("TRACKING", ("TrackingJoint", "SwingReference", "WristReference")),
         timing=protocol.layout(
@@ -288,6 +315,18 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
     )
 
 
+def recovery_frames(controller: str) -> np.ndarray:
+    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT; shape (3, 16)."""
+    return np.array(
+        [
+            nmt_frame(NMT_START, node=0),
+            motion_frame(0, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
+            motion_frame(0, REQUEST_RESET_FAULT),
+        ],
+        dtype=np.uint8,
+    )
+
+
 def sensor_noise(machine: Machine, seed: int, ticks: int) -> np.ndarray:
     """What chance does in each tick, shape (ticks, 12); same seed, same bytes, however long the run.
 
@@ -351,9 +390,10 @@ def make_session(
         timeline=timeline,
         monitor_layout=monitor_layout(),
         monitor=Monitor(
-            whole=np.zeros(12, dtype=np.int64),
+            whole=np.zeros(16, dtype=np.int64),
             load=np.zeros(2),
             reference=np.zeros(2),
+            sent=np.zeros(2),
             theta=np.full(len(THETA), np.nan),
             theta_sd=np.full(len(THETA), np.nan),
         ),
@@ -367,8 +407,14 @@ def make_session(
             load_est=np.zeros(ticks),
             load_sd=np.zeros(ticks),
             mode=np.zeros(ticks, dtype=np.int64),
+            valves=np.zeros((ticks, 4)),
+            emergency=np.zeros((EMERGENCIES_MOST, 3), dtype=np.int64),
         ),
         noise=sensor_noise(plant_machine, seed, ticks),
+        injection=injection.make_injection(
+            scenario.faults, timeline.motion, period_s, seed, recovery_frames(controller)
+        ),
+        faulty=bool(scenario.faults),
     )
 
 
@@ -387,6 +433,11 @@ def reference_at(start: float, target: float, elapsed: float, total: float) -> f
 def update_references(session: Session, tick: int) -> None:
     """Start the moves due at this tick and record the references."""
     schedule, index, move = session.schedule, session.progress.index, session.progress.move
+    if session.faulty and not drives(session.monitor.whole[MODE]):
+        # no move goes out: what comes later starts where the ECU then holds the joint
+        move[:, 3] = 0.0
+        while index[NEXT_MOVE] < schedule.move_tick.size and schedule.move_tick[index[NEXT_MOVE]] <= tick:
+            index[NEXT_MOVE] += 1
     while index[NEXT_MOVE] < schedule.move_tick.size and schedule.move_tick[index[NEXT_MOVE]] <= tick:
         n = index[NEXT_MOVE]
         joint = schedule.move_joint[n]
@@ -407,30 +458,18 @@ def update_references(session: Session, tick: int) -> None:
 
 
 @njit(cache=True)
-def is_parked(session: Session) -> bool:
-    """The pump is off and the arm rests on its support: nothing moves, all chambers are at tank pressure."""
-    return session.progress.index[TICK] < session.timeline.parked
-
-
-@njit(cache=True)
-def begin_sync(session: Session, sync_counter: int) -> int:
-    """First part of :func:`on_sync`: 1 to go on, -1 when the run is over, 0 for a SYNC that came twice."""
-    index, schedule = session.progress.index, session.schedule
-    tick = index[TICK]
-    if tick >= session.noise.shape[0]:
-        return -1
+def load_due(session: Session, tick: int) -> None:
+    """Change the load where the scenario says so."""
+    schedule, index = session.schedule, session.progress.index
     if index[NEXT_LOAD] < schedule.load_tick.size and schedule.load_tick[index[NEXT_LOAD]] <= tick:
         session.node.load[0] = schedule.load_kg[index[NEXT_LOAD]]
         index[NEXT_LOAD] += 1
-    return 0 if sync_counter == session.node.count[SYNC_LAST] else 1
 
 
 @njit(cache=True)
-def answer_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
-    """Last part of :func:`on_sync`, once the plant has moved on: record, and write the answer to ``out``."""
-    index = session.progress.index
-    tick = index[TICK]
-    schedule, record, node = session.schedule, session.record, session.node
+def master_frames(session: Session, tick: int, out: np.ndarray) -> int:
+    """Write the master's commands of this tick to ``out``; how many."""
+    schedule, index = session.schedule, session.progress.index
     rows = 0
     while (
         index[NEXT_FRAME] < schedule.frame_tick.size
@@ -441,66 +480,277 @@ def answer_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
             out[rows, k] = schedule.frame_row[index[NEXT_FRAME], k]
         rows += 1
         index[NEXT_FRAME] += 1
-    rows += node_sample(
-        node,
-        session.plant,
-        session.layout,
-        session.errors,
-        is_parked(session),
-        sync_counter,
-        session.noise[tick],
-        out[rows:],
-    )
-    for k in range(STATES):
-        record.state[tick, k] = node.y[k]
-    record.command[tick, 0] = node.u[1, 0]
-    record.command[tick, 1] = node.u[1, 1]
-    record.load_true[tick] = node.load[0]
-    record.load_est[tick] = session.monitor.load[0]
-    record.load_sd[tick] = session.monitor.load[1]
-    record.mode[tick] = session.monitor.whole[MODE]
-    update_references(session, tick)
-    index[TICK] = tick + 1
     return rows
 
 
 @njit(cache=True)
+def record_tick(session: Session, tick: int) -> None:
+    """The row of this tick."""
+    record, node, monitor = session.record, session.node, session.monitor
+    for k in range(STATES):
+        record.state[tick, k] = node.y[k]
+    for i in range(2):
+        record.command[tick, i] = node.u[1, i]
+        record.valves[tick, i] = node.u[0, i]
+        record.valves[tick, 2 + i] = monitor.sent[i]
+    record.load_true[tick] = node.load[0]
+    record.load_est[tick] = monitor.load[0]
+    record.load_sd[tick] = monitor.load[1]
+    record.mode[tick] = monitor.whole[MODE]
+    update_references(session, tick)
+    session.progress.index[TICK] = tick + 1
+
+
 def on_sync(session: Session, sync_counter: int, out: np.ndarray) -> int:
     """Answer SYNC: the plant moves on, the record gets a row, the answer is written to ``out``.
 
     Returns
     -------
     int
-        Rows of ``out`` to send in this order: the master's commands of this tick, then the sensor frames.
+        Rows of ``out`` to send in this order: the master's commands of this tick, the sensor frames, and the
+        node's heartbeat when it is due; whatever faults have made of them.
         -1 when the run is over: nothing was done. 0 for a SYNC that came twice.
     """
-    go_on = begin_sync(session, sync_counter)
-    if go_on <= 0:
-        return go_on  # over, or the same SYNC again: answered already
-    tick = session.progress.index[TICK]
-    for _ in range(periods_due(session.node, sync_counter)):
-        if not is_parked(session):
-            advance_one_period(session.node, session.plant, session.timing, session.errors, session.noise[tick, 7])
-    return answer_sync(session, sync_counter, out)
+    return int((on_sync_with_faults if session.faulty else on_sync_plain)(session, sync_counter, out))
+
+
+def on_frame(session: Session, row: np.ndarray) -> None:
+    """Take any other frame from the bus: valve commands for the node, the rest for the monitor."""
+    (on_frame_with_faults if session.faulty else on_frame_plain)(session, row)
 
 
 @njit(cache=True)
-def on_frame(session: Session, row: np.ndarray) -> None:
-    """Take any other frame from the bus: valve commands for the node, the rest for the monitor."""
+def on_sync_plain(session: Session, sync_counter: int, out: np.ndarray) -> int:
+    """As :func:`on_sync`, for compiled code and a session without faults."""
+    tick = session.progress.index[TICK]
+    if tick >= session.noise.shape[0]:
+        return -1
+    load_due(session, tick)
+    if sync_counter == session.node.count[SYNC_LAST]:
+        return 0  # the same SYNC again: answered already
+    rows = master_frames(session, tick, out)
+    rows += answer(session, session.plant, session.timing, tick, sync_counter, out[rows:])
+    record_tick(session, tick)
+    return rows
+
+
+@njit(cache=True)
+def answer(
+    session: Session, plant: PlantParameters, timing: NodeTiming, tick: int, sync_counter: int, out: np.ndarray
+) -> int:
+    """What the node sends on SYNC; the rows written to ``out``."""
+    rows = node_sync(
+        session.node,
+        plant,
+        session.layout,
+        timing,
+        session.errors,
+        tick < session.timeline.parked,
+        sync_counter,
+        session.noise[tick],
+        out,
+    )
+    if tick % timing.heartbeat_ticks == 0:
+        node_heartbeat(session.layout, out[rows])
+        rows += 1
+    return rows
+
+
+# ---- with faults ---------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) -> int:
+    """As :func:`on_sync`, with the faults of the scenario."""
+    tick = session.progress.index[TICK]
+    if tick >= session.noise.shape[0]:
+        return -1
+    if sync_counter == session.node.count[SYNC_LAST]:
+        return 0
+    if not injection.sync_reaches_node(session.injection, tick):
+        return without_sync(session, out)
+    load_due(session, tick)
+    plant = injection.plant_now(session.injection, session.plant, tick, session.timeline.period_s)
+    timing = injection.timing_now(session.injection, session.timing, tick)
+    fresh = injection.fresh(session.injection)
+    rows = commands(session, tick, fresh)
+    own = rows
+    rows = injection.frames_of_others(session.injection, tick, sync_counter, fresh, rows)
+    load = session.node.load[0]
+    session.node.load[0] = injection.load_now(session.injection, load, tick)
+    foreign = rows
+    rows += answer(session, plant, timing, tick, sync_counter, fresh[rows:])
+    for k in range(own, foreign):
+        node_frame(session.node, session.layout, fresh[k])  # the node hears what others send, too
+    arrived = injection.disturb_answer(session.injection, tick, rows, out)
+    late = injection.to_node(session.injection)
+    for k in range(injection.late_valves(session.injection, tick)):
+        node_frame(session.node, session.layout, late[k])
+    record_tick(session, tick)
+    session.node.load[0] = load
+    return arrived
+
+
+@njit(cache=True)
+def without_sync(session: Session, out: np.ndarray) -> int:
+    """A tick in which no SYNC reaches the node: it goes on by its own clock and says nothing.
+
+    Returns
+    -------
+    int
+        Rows of ``out``: what others than the node send to the ECU; -1 when the run is over.
+    """
+    tick = session.progress.index[TICK]
+    if tick >= session.noise.shape[0]:
+        return -1
+    node = session.node
+    load_due(session, tick)
+    plant = injection.plant_now(session.injection, session.plant, tick, session.timeline.period_s)
+    timing = injection.timing_now(session.injection, session.timing, tick)
+    if injection.any_of(session.injection, injection.NODE_KILLED, tick):
+        for i in range(2):  # springs centre the spools
+            node.u[0, i] = node.u[1, i] = 0.0
+        node.count[COMMAND_NEW] = 0
+    load = node.load[0]
+    node.load[0] = injection.load_now(session.injection, load, tick)
+    if tick >= session.timeline.parked:
+        advance_one_period(node, plant, timing, session.errors, session.noise[tick, 7])
+    if node.count[SYNC_LAST] > 0:
+        node.count[SYNC_LAST] = node.count[SYNC_LAST] % SYNC_COUNTERS + 1
+        node.count[SYNC_LOST] += 1
+    rows = commands(session, tick, injection.fresh(session.injection))
+    if injection.nothing_from_ecu(session.injection, tick):
+        rows = 0  # nor does anything reach it
+    arrived = injection.disturb_answer(session.injection, tick, rows, out)
+    if injection.any_of(session.injection, injection.BUS_OFF, tick):
+        arrived = 0
+    record_tick(session, tick)
+    node.load[0] = load
+    return arrived
+
+
+@njit(cache=True)
+def commands(session: Session, tick: int, out: np.ndarray) -> int:
+    """The master's frames of this tick: as scheduled, without moves the ECU would refuse, and those that recover."""
+    mode = session.monitor.whole[MODE]
+    count = session.injection.count
+    due = master_frames(session, tick, out)
+    rows = 0
+    for k in range(due):
+        if injection.is_motion(session.injection, out[k]) and not drives(mode):
+            if injection.request_of(session.injection, out[k]) == REQUEST_MOVE:
+                continue
+        if k != rows:
+            injection.copy_row(out[k], out[rows])
+        rows += 1
+    recover = session.injection.recover
+    n = count[injection.RECOVER_NEXT]
+    if n < recover.size and recover[n] <= tick:
+        since = tick - recover[n]
+        if (drives(mode) and session.monitor.whole[NMT_STATE] == NMT_OPERATIONAL) or since > RECOVER_TICKS_MOST:
+            count[injection.RECOVER_NEXT] += 1
+        elif since % RECOVER_EVERY_TICKS == 0:
+            rows = recovery_frame(session, mode, out, rows)
+    for k in range(rows):
+        if injection.is_motion(session.injection, out[k]):
+            protect(out[k], count[injection.MOTION_COUNTER])
+            count[injection.MOTION_COUNTER] = (count[injection.MOTION_COUNTER] + 1) % E2E_STATES
+    return rows
+
+
+@njit(cache=True)
+def recovery_frame(session: Session, mode: int, out: np.ndarray, rows: int) -> int:
+    """Append the documented procedure's next request for an ECU in this mode; the rows then."""
+    if mode == MODE_INIT or session.monitor.whole[NMT_STATE] in (NMT_STOPPED, NMT_PRE_OPERATIONAL):
+        injection.copy_row(session.injection.row[0], out[rows])
+    elif mode in (MODE_STANDBY, MODE_HOLD):
+        injection.copy_row(session.injection.row[1], out[rows])
+    elif mode == MODE_FAULT:
+        injection.copy_row(session.injection.row[2], out[rows])
+    else:
+        return rows  # on its way
+    return rows + 1
+
+
+@njit(cache=True)
+def drives(mode: int) -> bool:
+    """Modes in which the ECU takes moves."""
+    return mode == MODE_RUN or mode == MODE_COMMISSION
+
+
+@njit(cache=True)
+def ecu_is_dead(session: Session) -> bool:
+    """True in a tick in which the ECU is killed."""
+    return injection.any_of(session.injection, injection.ECU_KILLED, session.progress.index[TICK])
+
+
+@njit(cache=True)
+def transmit_room(session: Session, most: int) -> int:
+    """Frames that the ECU's driver takes in the tick that begins, at most ``most``."""
+    return injection.transmit_room(session.injection, session.progress.index[TICK], most)
+
+
+def restarts(session: Session) -> list[int]:
+    """Ticks at which a killed ECU starts anew."""
+    plan = session.injection.plan
+    return sorted(set(plan[plan[:, injection.KIND] == injection.ECU_KILLED, injection.LAST].tolist()))
+
+
+@njit(cache=True)
+def hear_mode(session: Session, row: np.ndarray) -> None:
+    """The mode on an intact valve frame."""
+    whole = session.monitor.whole
+    whole[MODE] = row[DATA + 1] >> 4
+    if whole[MODE] == MODE_FAULT:
+        whole[FAULTED] = 1
+
+
+@njit(cache=True)
+def on_frame_plain(session: Session, row: np.ndarray) -> None:
+    """As :func:`on_frame`, for compiled code and a session without faults."""
+    if frame_id(row) != session.monitor_layout.valves_id:
+        hear(session, row)
+        return
+    tick = session.progress.index[TICK]
+    if tick == 0 or session.noise[tick - 1, 11] >= session.errors.frame_loss:
+        node_frame(session.node, session.layout, row)
+    if intact(row):
+        hear_mode(session, row)
+
+
+@njit(cache=True)
+def on_frame_with_faults(session: Session, row: np.ndarray) -> None:
+    """As :func:`on_frame`, with what the bus and the faults leave of the frame; the record has it as it was sent."""
+    tick = max(session.progress.index[TICK] - 1, 0)
+    if injection.nothing_from_ecu(session.injection, tick):
+        return
+    if frame_id(row) != session.monitor_layout.valves_id:
+        hear(session, row)
+        return
+    if session.noise[tick, 11] >= session.errors.frame_loss:
+        arrived = injection.to_node(session.injection)
+        for k in range(injection.disturb_valves(session.injection, tick, row)):
+            node_frame(session.node, session.layout, arrived[k])
+    if not intact(row):
+        return
+    hear_mode(session, row)
+    f, whole = session.layout.valves, session.monitor.whole
+    for i in range(2):
+        command = get(row, f[i, 0], f[i, 1], 1) * session.layout.command_step
+        enabled = get(row, f[2 + i, 0], f[2 + i, 1], 0) == VALVE_ACTIVE
+        session.monitor.sent[i] = command if enabled else 0.0
+        if abs(command) > 1.0 or (command != 0.0 and not enabled):
+            whole[OUTSIDE] += 1
+
+
+@njit(cache=True)
+def hear(session: Session, row: np.ndarray) -> None:
+    """What the monitor learns from a frame of the ECU."""
     layout, whole = session.monitor_layout, session.monitor.whole
     can_id = frame_id(row)
-    if can_id == layout.valves_id:
-        tick = session.progress.index[TICK]
-        if tick == 0 or session.noise[tick - 1, 11] >= session.errors.frame_loss:
-            node_frame(session.node, session.layout, row)
-        if intact(row):
-            whole[MODE] = row[DATA + 1] >> 4
-            if whole[MODE] == MODE_FAULT:
-                whole[FAULTED] = 1
-    elif can_id == layout.emergency_id:
-        if row[4] == 8 and get(row, layout.emergency[0, 0], layout.emergency[0, 1], 0) != 0:
-            whole[EMERGENCY] = get(row, layout.emergency[0, 0], layout.emergency[0, 1], 0)
-            whole[FAULT] = get(row, layout.emergency[1, 0], layout.emergency[1, 1], 0)
+    if can_id == layout.emergency_id:
+        if row[4] == 8:
+            take_emergency(session, row)
     elif can_id == layout.estimate_id and intact(row):
         f = layout.estimate
         session.monitor.load[0] = get(row, f[0, 0], f[0, 1], 1) * layout.load_step
@@ -531,6 +781,29 @@ def on_frame(session: Session, row: np.ndarray) -> None:
         elif page == 3:
             whole[REFUSED] = get(row, f[7, 0], f[7, 1], 0)
             whole[LAST_REFUSAL] = get(row, f[8, 0], f[8, 1], 0)
+    elif can_id == layout.heartbeat_id and row[4] == 1:
+        whole[NMT_STATE] = row[DATA]
+        if row[DATA] == 0:  # the ECU begins anew, and counts anew
+            whole[MODE] = MODE_INIT
+            if session.node.count[SYNC_LAST] > 0:
+                session.node.count[SYNC_LAST] = SYNC_COUNTERS
+                whole[REBOOTS] += 1
+
+
+@njit(cache=True)
+def take_emergency(session: Session, row: np.ndarray) -> None:
+    """An emergency of the ECU; error code 0 says that it is over."""
+    f, whole = session.monitor_layout.emergency, session.monitor.whole
+    code, fault = get(row, f[0, 0], f[0, 1], 0), get(row, f[1, 0], f[1, 1], 0)
+    if code != 0:
+        whole[EMERGENCY] = code
+        whole[FAULT] = fault
+    n = whole[EMERGENCIES]
+    if n < EMERGENCIES_MOST:
+        session.record.emergency[n, 0] = max(session.progress.index[TICK] - 1, 0)
+        session.record.emergency[n, 1] = code
+        session.record.emergency[n, 2] = fault
+        whole[EMERGENCIES] = n + 1
 
 
 def trace_sha256(record: Record, ticks: int) -> str:

@@ -8,7 +8,7 @@ Examples
 
 The stack is the deepest path of the call graph (gcc's -fcallgraph-info=su, with the calls found in the machine code)
 plus the deepest interrupt; recursion, a frame of unknown size and an indirect call without known targets are errors.
-Instructions are counted by SysTick in QEMU with -icount while the arm moves.
+Instructions are counted by SysTick in QEMU with -icount, of every tick of runs with all laws and a tare.
 """
 
 from __future__ import annotations
@@ -60,13 +60,14 @@ COUNT = "-DDIARC_COUNT_INSTRUCTIONS=ON"
 # The run that is counted: what is carried changes on the way, so that the estimator also starts its filters anew.
 LOADS = (LoadStep(0.0, 2.5), LoadStep(1.0, 7.5))
 # Law and how long; the mean is of the first, the maximum of all.
-RUNS = (("diarc", 3.0), ("pid", 3.0), ("diarc-noload", 0.5))
-SHORT_RUNS = (("diarc", 3.0), ("pid", 0.5), ("diarc-noload", 0.5))  # the same budget, without the split of the law
+RUNS = (("diarc", 3.0), ("pid", 1.0), ("diarc-noload", 1.0))
+SHORT_RUNS = (("diarc", 3.0), ("pid", 0.5), ("diarc-noload", 0.5))
 ATTEMPTS = 3  # of a check, before it says that instructions have grown
 
 # Registers that the processor itself pushes when an interrupt comes, with the word that aligns the stack.
 EXCEPTION_BYTES = {"float": 104 + 4, "fixed": 32 + 4}  # with and without those of the FPU
 POINTERS = {"send": 4, "receive": 8, "now_us": 12}  # of struct ecu_port, and where in it
+STORE_AT, STORE_POINTERS = 16, ("read", "erase", "program")  # of struct store_port, which no image has yet
 PORT_SYMBOL, ROOT_FUNCTION = "the_port", "reset"
 VECTORS_WORDS = 48  # the initial stack pointer, reset, 46 more
 
@@ -78,6 +79,15 @@ NAMES = {
     "insn_mean": "instructions a tick, mean",
     "insn_max": "instructions a tick, maximum",
     "insn_floor": "instructions the arithmetic alone needs",
+}
+STAGE_TITLES = {
+    "receive": "receive",
+    "frames: samples, supervision, packing": "frames",
+    "estimate": "estimate",
+    "control": "control",
+    "send": "send",
+    "a tick: all but receive": "tick",
+    "UART": "uart",
 }
 GOALS = {
     preset: {"flash_bytes": 32 * 1024, "ram_bytes": 4096, "stack_bytes": 1024, "insn_max": instructions}
@@ -194,6 +204,8 @@ class CallGraph:
             called = re.findall(r"\tb[a-z]*(?:\.[nw])?\t[0-9a-f]+ <([^>+]+)>", body)
             self.calls.setdefault(name, set()).update(_function(c) for c in called if c != header)
             jumps = re.findall(r"\t(blx?\tr\w+|bx\t(?!lr)\w+|(?:mov|ldr)[a-z.]*\tpc, (?!\[sp\]).*)", body)
+            if name in known:  # a switch: the compiler has told of every call through a pointer
+                jumps = [jump for jump in jumps if not re.match(r"ldr[a-z.]*\tpc, \[r\d+, r\d+, lsl #2\]", jump)]
             if jumps and name not in self.pointers:
                 raise BudgetError(f"{name} calls through a pointer that is in no call graph: {jumps}")
             if name not in known:
@@ -205,7 +217,7 @@ class CallGraph:
         Parameters
         ----------
         targets : dict
-            Member of struct ecu_port, and function.
+            Member of struct ecu_port or store_port, and function; "" for one that is never called.
 
         Raises
         ------
@@ -219,7 +231,8 @@ class CallGraph:
                 member = re.match(r"(?:\w+ = )?port->(\w+)\(", text[int(column) - 1 :])
                 if member is None or member[1] not in targets:
                     raise BudgetError(f"{name} calls through a pointer of unknown content: {place}: {text.strip()}")
-                self.calls.setdefault(name, set()).add(targets[member[1]])
+                if targets[member[1]]:
+                    self.calls.setdefault(name, set()).add(targets[member[1]])
 
     def deepest(self, root: str, path: tuple[str, ...] = ()) -> tuple[int, list[str]]:
         """Bytes and functions of the deepest path from a function.
@@ -245,8 +258,8 @@ class CallGraph:
 
 
 def _function(title: str) -> str:
-    """Name without the file before it."""
-    return title.rsplit(":", 1)[-1]
+    """Name without the file before it, and without what the linker's --wrap has before the function it wraps."""
+    return title.rsplit(":", 1)[-1].removeprefix("__real_")
 
 
 def _pushed(name: str, body: str) -> int:
@@ -314,8 +327,11 @@ def port_functions(elf: Path) -> dict[str, str]:
     begin = [address for address, _, name in _symbols(elf) if name == PORT_SYMBOL]
     if len(begin) != 1:
         raise BudgetError(f"{elf.name} has not one {PORT_SYMBOL} but {len(begin)}")
-    words = _words(elf, begin[0], 4)
-    return dict(zip(POINTERS, _functions_at(elf, [words[at // 4] for at in POINTERS.values()]), strict=True))
+    words = _words(elf, begin[0], 5)
+    if words[STORE_AT // 4] != 0:
+        raise BudgetError(f"{elf.name} has a store: say here what is in its pointers")
+    functions = _functions_at(elf, [words[at // 4] for at in POINTERS.values()])
+    return dict(zip(POINTERS, functions, strict=True)) | dict.fromkeys(STORE_POINTERS, "")
 
 
 def interrupt_functions(elf: Path) -> set[str]:
@@ -348,15 +364,15 @@ Runs = tuple[tuple[str, float], ...]
 def count(image: Image, elf: Path, machine: Machine, runs: Runs) -> tuple[dict[str, tuple[int, int]], int]:
     """Mean and most instructions of each stage over the runs, and the stack that was seen in use.
 
-    Receive and UART depend on when the host delivers its bytes. Law and send do not: the same run gives the same
-    counts, to one instruction.
+    Receive and UART depend on when the host delivers its bytes. The others do not: the same run gives the same counts,
+    to one instruction.
     """
     scenario = counted_scenario()
     ticks, sums = [0], [dict.fromkeys(emulated_board.STAGES, 0)]
     with EmulatedBoard(image, elf, counting=True) as board:
         for law, duration_s in runs:
             run = session.make_session(
-                machine, replace(scenario, duration_s=duration_s), law, scenario.seed, execution.PERIOD_US * 1e-6
+                machine, replace(scenario, duration_s=duration_s), law, scenario.seed, execution.PERIOD_US * 1e-6, True
             )
             execution.over_bus(run, parse_bus(board.bus), None, b"", lambda _: board.check(), True)
             failed = execution.outcome(run)
@@ -372,8 +388,6 @@ def count(image: Image, elf: Path, machine: Machine, runs: Runs) -> tuple[dict[s
     stages = {
         name: (round(means[0][name]), values[2]) for name, values in figures.instructions.items() if name != "wait"
     }
-    # Under PID the law's stage is the estimator, the frames and little else.
-    stages["law under PID"] = (round(means[1]["law"]), 0)
     return stages, figures.stack_bytes
 
 
@@ -387,7 +401,7 @@ def measure(image: Image, machine: Machine, runs: Runs) -> Measured:
     stages, used = count(image, counting, machine, runs)
     if used > bound:
         raise BudgetError(f"{image.preset} used {used} bytes of stack, more than the call graph's {bound}")
-    insn_mean, insn_max = (stages["law"][k] + stages["send"][k] for k in (0, 1))
+    insn_mean, insn_max = stages["tick"]
     budget = Budget(flash, ram, stack, insn_mean, insn_max, budget_floor.floor(image.scalar))
     return Measured(budget, stages, deepest)
 
@@ -495,13 +509,8 @@ def budget_head(measured: dict[str, Measured]) -> list[str]:
 def stage_rows(measured: dict[str, Measured]) -> list[list[str]]:
     """Stage, then mean and maximum of each image."""
     rows = []
-    for title, name in (("receive", "receive"), ("estimate and control", "law"), ("send", "send"), ("UART", "uart")):
+    for title, name in STAGE_TITLES.items():
         rows.append([title, *(f"{found.stages[name][k]:,}" for found in measured.values() for k in (0, 1))])
-    estimate = [found.stages["law under PID"][0] for found in measured.values()]
-    control = [found.stages["law"][0] - mean for found, mean in zip(measured.values(), estimate, strict=True)]
-    for title, means in (("of which estimate, about", estimate), ("of which control, about", control)):
-        rows.insert(2, [title, *(cell for mean in means for cell in (f"{mean:,}", ""))])
-    rows[2], rows[3] = rows[3], rows[2]
     return rows
 
 
@@ -516,7 +525,7 @@ def readme_part(measured: dict[str, Measured]) -> str:
     return "\n\n".join(
         [
             markdown(budget_head(measured), budget_rows(measured)),
-            "Instructions are those of estimate, control and sending, counted in QEMU; how, and what the arithmetic\n"
+            "Instructions are those of a tick but for receiving, counted in QEMU; how, and what the arithmetic\n"
             "needs: [docs/porting.md](docs/porting.md#what-it-costs). `make budget` measures again.",
         ]
     )
@@ -542,18 +551,18 @@ def document_part(measured: dict[str, Measured]) -> str:
             "  pushes and the deepest interrupt. Frames are the compiler's (`-fcallgraph-info=su`), those of libgcc\n"
             "  are read from the machine code. Calls through pointers are the port's three, resolved from what the\n"
             "  image has in `the_port`. Recursion, a frame that is not constant, or any other pointer is an error.\n"
-            "- **Instructions** are of ticks in mode RUN: in the others the law is disarmed and only the estimator's\n"
-            f"  samples are kept. Counted in QEMU over {runs}\n"
-            f"  ({loads}); the mean is of the first, the maximum of all. The\n"
-            "  figure compared is estimate, control and send: the same run gives the same counts, to a few,\n"
-            "  unless a byte comes in between: the entry of its interrupt is counted too, so the least of repeated\n"
-            "  measurements is taken. The maximum is the sum of both stages' maxima, no less than any tick's.\n"
+            "- **Instructions** are of every tick from the opening of the channel on: INIT, STANDBY, TARE, RUN.\n"
+            f"  Counted in QEMU over {runs}\n"
+            f"  ({loads}); the mean is of the first run, the maximum of all ticks of all.\n"
+            "  The figure compared is a tick's frames, estimate, control and send together: a run gives the\n"
+            "  same counts, to a few, unless a byte comes in between: its interrupt's entry is counted too, so the\n"
+            "  least of repeated measurements is taken. What measuring itself takes is taken off.\n"
             "  Receiving depends on how the UART's bytes arrive and is not in the figure.",
             "Instructions a tick, by stage:",
             markdown(["", *presets], stage_rows(measured)),
-            "`receive`, `send` and `UART` are mostly the text of SLCAN. The split of estimate and control is by the\n"
-            "same run under PID, where control is next to nothing; reference, observer, cylinder geometry and the\n"
-            "packing of frames, which both laws need, go with the estimate.",
+            "`receive`, `send` and `UART` are mostly SLCAN text. `estimate` is `estimator_step`, `control` the\n"
+            "rest of `controller_step`: reference, observer, cylinder geometry, law. The image that counts is the\n"
+            "same code, linked with `--wrap` around these two.",
             "The deepest paths:\n\n" + "\n".join(paths),
             "What the arithmetic needs, in operations a tick, counted by hand in `tools/budget_floor.py`; no loads,\n"
             "stores, calls or comparisons:",

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 JOINTS = 2
+BALANCED = 0.25  # of the ticks balance a joint's rows: one window of the estimator is four ticks
 THETA_M, THETA_H = 9, 5
 # row_parameter in arm_model.c and hydraulic_parameter in estimator.c: where a row's columns are in theta
 MECHANICS = ((0, 1, 2, 3, 5, 7), (0, 1, 2, 4, 6, 8))
@@ -54,9 +55,8 @@ LOW_PASS = Operations(mul=2, add=4)  # both poles
 LOW_PASS_OF_RATE = Operations(mul=3, add=4)  # of a difference quotient alone
 LOW_PASS_OF_BOTH = Operations(mul=4, add=7)
 GATE = Operations(mul=1)
-FRICTION = (
-    Operations(mul=4, div=1) + polynomial(TERMS) + Operations(add=1)
-)  # lever^2 w, lever s(w), arctangent of a ratio
+LEVERS = Operations(mul=3)  # lever^2 w, lever s(w)
+FRICTION = LEVERS + Operations(mul=1, div=1) + polynomial(TERMS) + Operations(add=1)  # and the arctangent of a ratio
 CENTRIFUGAL = Operations(mul=9, add=2)  # and gravity, of the wrist's row
 
 
@@ -99,15 +99,19 @@ def terms() -> list[tuple[str, Operations]]:
         ("radius of the tip, measured and wanted", 2 * Operations(mul=1, add=1)),
         ("cylinder: length, lever, volumes", JOINTS * Operations(mul=6, add=7, div=3, root=1)),
         ("force, flow, leakage, valve gain of both signs", JOINTS * Operations(mul=12, add=11, root=4)),
-        ("half steps: rates, trigonometry", JOINTS * Operations(mul=2, add=1) + 3 * Operations(mul=1, add=1)),
-        ("momentum, both rows", Operations(mul=8)),
-        ("forces, both rows", CENTRIFUGAL + JOINTS * FRICTION),
-        ("filters of the swing's row", 3 * with_rate + 2 * plain + with_both + Operations(mul=1)),
-        ("filters of the wrist's row", 2 * with_both + 4 * plain + Operations(mul=1)),
-        ("gate and its filter", JOINTS * (LOW_PASS + Operations(mul=2, add=1)) + Operations(add=1)),
+        ("samples of the window", JOINTS * Operations(mul=3)),
+        (
+            "windows: rates, trigonometry, mean torque",
+            BALANCED * (JOINTS * Operations(mul=4, add=14) + 3 * Operations(mul=1, add=1)),
+        ),
+        ("momentum, both rows", BALANCED * Operations(mul=8)),
+        ("forces, both rows", BALANCED * (CENTRIFUGAL + JOINTS * LEVERS)),
+        ("filters of the swing's row", BALANCED * (3 * with_rate + 2 * plain + with_both + Operations(mul=1))),
+        ("filters of the wrist's row", BALANCED * (2 * with_both + 4 * plain + Operations(mul=1))),
+        ("gate and its filter", BALANCED * JOINTS * (LOW_PASS + Operations(mul=2, add=1)) + Operations(add=1)),
         (
             "hydraulic rows and their filters",
-            JOINTS * (Operations(mul=10, add=6, div=1) + with_rate + 3 * plain),
+            BALANCED * JOINTS * (Operations(mul=10, add=12, div=1) + with_rate + 3 * plain),
         ),
         ("update of one row of four in turn, mean: residual, UD factors, theta", mean_row),
         ("rate limit of the estimate", (THETA_M + THETA_H) * Operations(add=2)),

@@ -71,6 +71,13 @@ fi
 
 if [ "$purpose" = test ]; then
     need clang clang
+    # libFuzzer: on some releases in a package of its own, named after clang's release
+    fuzz_nothing='int LLVMFuzzerTestOneInput(const char *d, unsigned long n) { return d == 0 && n > 0; }'
+    if ! have clang; then
+        ! apt-cache show libclang-rt-dev >/dev/null 2>&1 || missing+=(libclang-rt-dev)
+    elif ! echo "$fuzz_nothing" | clang -fsanitize=fuzzer -x c -o /dev/null - 2>/dev/null; then
+        missing+=("libclang-rt-$(clang -dumpversion | cut -d . -f 1)-dev")
+    fi
     need cppcheck cppcheck
     # headers and libraries for gcc -m32, for PCs only
     if [ "$(uname -m)" = x86_64 ] && ! echo '#include <stdio.h>' | gcc -m32 -E - >/dev/null 2>&1; then

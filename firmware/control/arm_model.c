@@ -9,13 +9,13 @@ const uint8_t row_parameter[JOINTS][ROW_COLUMNS] = {
 
 struct wrist_trig wrist_trig(const struct arm *arm, scalar q2)
 {
-    const scalar c = cosine(q2);
-    return (struct wrist_trig){.s = sine(q2), .c = c, .r = arm->L1 + mul(arm->L2, c)};
+    const struct sine_cosine at = sine_cosine(q2);
+    return (struct wrist_trig){.s = at.s, .c = at.c, .r = arm->L1 + mul(arm->L2, at.c)};
 }
 
 scalar coulomb_sign(const struct arm *arm, scalar w)
 {
-    return mul(TWO_OVER_PI, arctangent(w, arm->coulomb_rate));
+    return w == SCALAR(0) ? SCALAR(0) : mul(TWO_OVER_PI, arctangent(w, arm->coulomb_rate));
 }
 
 void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
@@ -40,32 +40,32 @@ static void wrist_centrifugal_and_gravity(const struct arm *arm, const struct wr
     const scalar w1_squared = mul(w1, w1);
     const scalar L2_s_w1_squared = mul(mul(arm->L2, t->s), w1_squared);
     const scalar g_L2_c = mul(mul(arm->g, arm->L2), t->c);
-    row->phi[COL_M_T] += mul(L2_s_w1_squared, t->r) + g_L2_c;
+    row->phi[COL_M_T] += narrow(add_product(wide_of(g_L2_c), L2_s_w1_squared, t->r));
     row->phi[COL_J] += mul(mul(t->c, t->s), w1_squared);
-    row->phi[COL_M2] += mul(SCALAR(0.5), mul(L2_s_w1_squared, arm->L1) + g_L2_c);
+    row->phi[COL_M2] += mul(SCALAR(0.5), narrow(add_product(wide_of(g_L2_c), L2_s_w1_squared, arm->L1)));
 }
 
 /* F = fv x' + fc s(x') at a lever arm: torque R F, with x' = R q'. */
-static void friction_and_offset(const struct arm *arm, scalar w, scalar friction_w, scalar lever,
-                                struct arm_row *row)
+static void friction_and_offset(scalar w, scalar sign, scalar lever, struct arm_row *row)
 {
     row->phi[COL_FV] = mul(mul(lever, lever), w);
-    row->phi[COL_FC] = mul(lever, coulomb_sign(arm, friction_w));
+    row->phi[COL_FC] = mul(lever, sign);
     row->phi[COL_OM] = SCALAR(-1);
 }
 
 void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
-               scalar friction_w, scalar lever, struct arm_row *row)
+               scalar sign, scalar lever, struct arm_row *row)
 {
     *row = (struct arm_row){0};
     if (i == WRIST) {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);
     }
-    friction_and_offset(arm, w[i], friction_w, lever, row);
+    friction_and_offset(w[i], sign, lever, row);
 }
 
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever, struct arm_row *row)
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar sign, scalar lever,
+                          struct arm_row *row)
 {
     arm_momentum(arm, t, i, a, row); /* H is linear in the same columns: H q'' is the momentum of a */
     if (i == SWING) {                /* dH11/dq2 q1' q2', Eq 3 */
@@ -77,24 +77,28 @@ void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enu
     } else {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);
     }
-    friction_and_offset(arm, w[i], w[i], lever, row);
+    friction_and_offset(w[i], sign, lever, row);
 }
 
 scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar theta[THETA_M])
 {
-    scalar torque = row->known;
+    wide torque = wide_of(row->known);
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        torque = add_limited(torque, mul(row->phi[k], theta[row_parameter[i][k]]));
+        torque = add_product(torque, row->phi[k], theta[row_parameter[i][k]]);
     }
-    return torque;
+    return narrow(torque);
 }
 
 scalar arm_inertia(const struct arm *arm, const struct wrist_trig *t, enum joint i,
                    const scalar theta[THETA_M])
 {
+    wide H;
     if (i == SWING) {
-        return arm->I1 + mul(theta[M2], mul(arm->L1, t->r)) + mul(theta[J], mul(t->c, t->c)) +
-               mul(theta[M_T], mul(t->r, t->r));
+        H = add_product(wide_of(arm->I1), theta[M2], mul(arm->L1, t->r));
+        H = add_product(H, theta[J], mul(t->c, t->c));
+        H = add_product(H, theta[M_T], mul(t->r, t->r));
+    } else {
+        H = add_product(wide_of(theta[J]), theta[M_T], mul(arm->L2, arm->L2));
     }
-    return theta[J] + mul(theta[M_T], mul(arm->L2, arm->L2));
+    return narrow(H);
 }

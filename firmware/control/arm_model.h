@@ -57,15 +57,16 @@ void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint 
                   struct arm_row *row);
 
 /* All terms of row i but the momentum's rate and R F: Coriolis and gravity, friction, offset.
- * friction_w, rad/s, is the speed that friction's sign is taken of; lever, the lever arm over that at q = 0,
- * where friction acts at the cylinder, else 1. */
+ * sign is coulomb_sign of the speed that friction is taken of; lever, the lever arm over that at q = 0, where
+ * friction acts at the cylinder, else 1. */
 void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
-               scalar friction_w, scalar lever, struct arm_row *row);
+               scalar sign, scalar lever, struct arm_row *row);
 
 /* phi2(q, q', q''), Eq 14: row i of the inverse dynamics; phi' theta + known = R F. a in rad/s^2;
- * lever as above. */
+ * sign and lever as above, sign of w[i]. */
 void arm_inverse_dynamics(const struct arm *arm, const struct wrist_trig *t, enum joint i,
-                          const scalar w[JOINTS], const scalar a[JOINTS], scalar lever, struct arm_row *row);
+                          const scalar w[JOINTS], const scalar a[JOINTS], scalar sign, scalar lever,
+                          struct arm_row *row);
 
 /* phi' theta + known, N m per unit. */
 scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar theta[THETA_M]);

@@ -43,17 +43,6 @@ void controller_gap(struct controller *controller)
     estimator_resume(&controller->estimator);
 }
 
-/* The law's parameters: the estimate, or the estimate without its load. */
-static void law_parameters(const struct controller *controller, scalar theta[THETA_M])
-{
-    for (uint8_t k = 0; k < THETA_M; k++) {
-        theta[k] = controller->estimator.law_m[k];
-    }
-    if (controller->kind != CONTROLLER_DIARC) {
-        theta[M_T] = SCALAR(0);
-    }
-}
-
 /* What estimator and law both need of a joint's valve and cylinder; its roots are taken once. */
 struct joint_flow {
     scalar gain_extending; /* QL per unit opening */
@@ -72,9 +61,10 @@ static struct joint_flow joint_flow(const struct machine *machine, enum joint i,
     };
 }
 
-static void estimate(struct controller *controller, const struct machine *machine,
-                     const struct controller_constants *constants, const struct measurement *measured,
-                     struct estimator_sample *sample, struct joint_flow flow[JOINTS])
+OWN_FRAME static void take_sample(const struct controller *controller, const struct machine *machine,
+                                  const struct controller_constants *constants,
+                                  const struct measurement *measured, struct estimator_sample *sample,
+                                  struct joint_flow flow[JOINTS])
 {
     sample->trig = wrist_trig(&machine->arm, measured->q[WRIST]);
     for (uint8_t i = 0; i < JOINTS; i++) {
@@ -82,6 +72,7 @@ static void estimate(struct controller *controller, const struct machine *machin
         const scalar *const p = measured->p[i];
         sample->dq[i] = measured->dq[i];
         sample->reference_w[i] = controller->output[i].reference.w;
+        sample->friction_sign[i] = coulomb_sign(&machine->arm, sample->reference_w[i]);
         sample->cylinder[i] = cylinder_at(cylinder, &constants->cylinder[i], measured->q[i]);
         sample->force[i] = cylinder_force(&constants->cylinder[i], p);
         sample->lever[i] = machine->arm.friction_at_cylinder > SCALAR(0.5)
@@ -92,18 +83,29 @@ static void estimate(struct controller *controller, const struct machine *machin
         const scalar valve = opening >= SCALAR(0) ? flow[i].gain_extending : flow[i].gain_retracting;
         sample->flow[i] = mul(opening, valve) - flow[i].leakage;
     }
-    estimator_step(&controller->estimator, &machine->estimator, &constants->estimator, &machine->arm, sample);
 }
 
-/* |theta_max - theta_min| |phi|, of what the law takes from the estimate. */
-static scalar torque_uncertainty(const struct estimator_constants *constants, const struct arm_row *row,
-                                 enum joint i)
+/* What the law takes from the estimate through one row. */
+struct row_torques {
+    scalar torque;      /* phi' theta + known */
+    scalar uncertainty; /* |theta_max - theta_min| |phi| */
+    scalar step;        /* phi' (theta - before) */
+};
+
+static struct row_torques row_torques(const struct arm_row *row, enum joint i, const scalar theta[THETA_M],
+                                      const scalar before[THETA_M], const scalar range[THETA_M])
 {
-    scalar sum = SCALAR(0);
+    wide torque = wide_of(row->known);
+    wide uncertainty = wide_of(SCALAR(0));
+    wide step = wide_of(SCALAR(0));
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        sum = add_limited(sum, mul(constants->scale_m[row_parameter[i][k]], absolute(row->phi[k])));
+        const uint8_t parameter = row_parameter[i][k];
+        const scalar phi = row->phi[k];
+        torque = add_product(torque, phi, theta[parameter]);
+        uncertainty = add_product(uncertainty, absolute(phi), range[parameter]);
+        step = add_product(step, phi, theta[parameter] - before[parameter]);
     }
-    return sum;
+    return (struct row_torques){narrow(torque), narrow(uncertainty), narrow(step)};
 }
 
 static scalar diarc_joint(struct controller *controller, const struct machine *machine,
@@ -120,20 +122,16 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     const enum theta_h om3 = i == SWING ? OM3_SWING : OM3_WRIST;
 
     struct arm_row phi2;
-    arm_inverse_dynamics(&machine->arm, desired, i, w, a, sample->lever[i], &phi2);
-    scalar torque_step = SCALAR(0);
-    for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        const uint8_t parameter = row_parameter[i][k];
-        torque_step = add_limited(torque_step,
-                                  mul(phi2.phi[k], theta[parameter] - controller->law_m_before[parameter]));
-    }
+    arm_inverse_dynamics(&machine->arm, desired, i, w, a, sample->friction_sign[i], sample->lever[i], &phi2);
+    const struct row_torques torques =
+        row_torques(&phi2, i, theta, controller->law_m_before, ranges->scale_m);
     const struct diarc_input in = {
         .e1 = out->e1,
         .e1_rate = out->e1_rate,
         .reference_w = w[i],
-        .torque_ff = arm_row_torque(&phi2, i, theta),
-        .torque_uncertainty = torque_uncertainty(ranges, &phi2, i),
-        .torque_step = torque_step,
+        .torque_ff = torques.torque,
+        .torque_uncertainty = torques.uncertainty,
+        .torque_step = torques.step,
         .H = arm_inertia(&machine->arm, desired, i, theta),
         .beta_inverse = theta_h[BETA_INVERSE],
         .beta_uncertainty = ranges->scale_h[BETA_INVERSE],
@@ -154,8 +152,9 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     return output.u;
 }
 
-void controller_step(struct controller *controller, const struct machine *machine,
-                     const struct controller_constants *constants, const struct measurement *measured)
+/* Reference, and the error from it. */
+static void follow_reference(struct controller *controller, const struct controller_constants *constants,
+                             const struct measurement *measured)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct joint_output *const out = &controller->output[i];
@@ -168,38 +167,68 @@ void controller_step(struct controller *controller, const struct machine *machin
         observer_step(&controller->observer[i], &constants->observer, out->e1, constants->dt_s);
         out->e1_rate = controller->observer[i].w;
     }
+}
 
-    struct estimator_sample sample;
-    struct joint_flow flow[JOINTS];
-    estimate(controller, machine, constants, measured, &sample, flow);
-    if (!controller->armed) {
-        return;
+static void pid_law(struct controller *controller, const struct machine *machine,
+                    const struct controller_constants *constants)
+{
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        struct joint_output *const out = &controller->output[i];
+        const scalar u =
+            pid_step(&controller->pid[i], &machine->pid[i], out->e1, out->e1_rate, constants->dt_s);
+        out->u = limit(valve_spool(&machine->cylinder[i], u), SCALAR(-1), SCALAR(1));
     }
+}
 
-    scalar theta[THETA_M];
-    law_parameters(controller, theta);
+OWN_FRAME static void diarc_law(struct controller *controller, const struct machine *machine,
+                                const struct controller_constants *constants,
+                                const struct measurement *measured, const struct estimator_sample *sample,
+                                const struct joint_flow flow[JOINTS])
+{
+    scalar theta[THETA_M]; /* the estimate, or the estimate without its load */
+    for (uint8_t k = 0; k < THETA_M; k++) {
+        theta[k] = controller->estimator.law_m[k];
+    }
+    if (controller->kind != CONTROLLER_DIARC) {
+        theta[M_T] = SCALAR(0);
+    }
+    scalar *const before = controller->law_m_before;
+    for (uint8_t k = 0; k < THETA_M && !controller->diarc[SWING].started; k++) {
+        before[k] = theta[k]; /* no step of the estimate before the first tick */
+    }
     const struct wrist_trig desired = wrist_trig(&machine->arm, controller->output[WRIST].reference.q);
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct joint_output *const out = &controller->output[i];
-        if (controller->kind == CONTROLLER_PID) {
-            out->u = pid_step(&controller->pid[i], &machine->pid[i], out->e1, out->e1_rate, constants->dt_s);
-        } else {
-            const bool first = !controller->diarc[i].started;
-            if (first) { /* no step of the estimate before the first tick */
-                for (uint8_t k = 0; k < THETA_M; k++) {
-                    controller->law_m_before[k] = theta[k];
-                }
-            }
-            out->u = diarc_joint(controller, machine, constants, &sample, &flow[i], (enum joint)i, theta,
-                                 &desired, out);
-        }
-        /* DIARC's set-point leads by a share of the spool's measured lag */
-        const scalar share = controller->kind == CONTROLLER_PID ? SCALAR(0) : machine->diarc[i].spool_lead;
-        const scalar spool = valve_spool(&machine->cylinder[i], out->u);
-        out->u = limit(spool + mul(share, spool - measured->spool[i]), SCALAR(-1), SCALAR(1));
-        trajectory_advance(&controller->trajectory[i], constants->dt_s);
+        const scalar u = diarc_joint(controller, machine, constants, sample, &flow[i], (enum joint)i, theta,
+                                     &desired, out);
+        /* the set-point leads by a share of the spool's measured lag */
+        const scalar spool = valve_spool(&machine->cylinder[i], u);
+        const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);
+        out->u = limit(spool + lead, SCALAR(-1), SCALAR(1));
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
-        controller->law_m_before[k] = theta[k];
+        before[k] = theta[k];
+    }
+}
+
+void controller_step(struct controller *controller, const struct machine *machine,
+                     const struct controller_constants *constants, const struct measurement *measured)
+{
+    struct estimator_sample sample;
+    struct joint_flow flow[JOINTS];
+    follow_reference(controller, constants, measured);
+    take_sample(controller, machine, constants, measured, &sample, flow);
+    estimator_step(&controller->estimator, &machine->estimator, &constants->estimator, &machine->arm,
+                   &sample);
+    if (!controller->armed) {
+        return;
+    }
+    if (controller->kind == CONTROLLER_PID) {
+        pid_law(controller, machine, constants);
+    } else {
+        diarc_law(controller, machine, constants, measured, &sample, flow);
+    }
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        trajectory_advance(&controller->trajectory[i], constants->dt_s);
     }
 }

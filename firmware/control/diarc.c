@@ -23,6 +23,7 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
                                   const struct diarc_input *in, scalar ff_rate)
 {
     const scalar R = in->cylinder.R;
+    const scalar per_R = quot(SCALAR(1), R);
     const scalar H = in->H;
     struct two_steps s;
 
@@ -31,14 +32,14 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
     const scalar k2s1 = robust_gain(gains->gamma1_max + in->torque_uncertainty, gains->eta1,
                                     amp(gains->k2s1_max, H)); /* Eq 22 */
     const scalar feedback = amp(gains->k2, mul(H, s.e2));
-    s.F_Ld = quot(in->torque_ff - feedback - diarc->gamma1 - mul(k2s1, s.e2), R); /* Eq 14, 20 */
+    s.F_Ld = mul(in->torque_ff - feedback - diarc->gamma1 - mul(k2s1, s.e2), per_R); /* Eq 14, 20 */
 
     /* F_Ld'_c: the feed-forward's difference, free of noise, and the feedback's analytic derivative with
      * H e2'^ from the model: H (q''^ - qd'') = R F - phi2' theta^ + gamma1. R' is left out: 0.1 % of it. */
     const scalar H_e2_rate =
         mul(R, in->force) - in->torque_ff + diarc->gamma1 + amp(gains->k1, mul(H, in->e1_rate));
     const scalar gamma1_rate = amp(gains->kappa1, mul(H, s.e2)); /* Eq 20 */
-    const scalar compliance = quot(in->beta_inverse, R); /* as a factor of the terms it keeps them small */
+    const scalar compliance = mul(in->beta_inverse, per_R); /* as a factor of the terms it keeps them small */
     const scalar F_Ld_flow = mul(compliance, ff_rate - gamma1_rate) -
                              amp(gains->k2, mul(compliance, H_e2_rate)); /* theta_8 F_Ld'_c, Eq 17 */
 

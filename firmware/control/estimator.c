@@ -3,10 +3,6 @@
 /* An update needs the gate open over this much of the filter's window. */
 #define LEAST_OPEN SCALAR(0.02)
 
-/* Rows in turn: one update a tick keeps the longest tick short, and samples of a filtered row that follow one
- * another hold little that is new. */
-#define ROW_TURNS 4
-
 /* This many innovations in a row that are too large mean a changed load. */
 #define STRIKES 3
 
@@ -21,9 +17,13 @@ static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
 struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s)
 {
     struct estimator_constants constants = {0};
-    constants.filter = quot(dt_s, parameters->filter_time + dt_s);
+    const scalar window_s = mul(dt_s, SCALAR(ROW_TURNS));
+    constants.filter = quot(window_s, parameters->filter_time + window_s);
+    constants.filter_rate = gain_quot(constants.filter, window_s);
+    constants.ramp_step = quot(dt_s, parameters->filter_time + dt_s);
     constants.per_tick = gain_quot(SCALAR(1), dt_s);
-    constants.filter_rate = gain_quot(constants.filter, dt_s);
+    constants.per_window = gain_quot(SCALAR(1), window_s);
+    constants.per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
     for (uint8_t i = 0; i < JOINTS; i++) {
         constants.noise_m[i] = variance_of(parameters->torque_noise[i]);
         constants.noise_h[i] = variance_of(parameters->flow_noise[i]);
@@ -79,15 +79,16 @@ void estimator_start(struct estimator *estimator, const struct estimator_paramet
 
 void estimator_commission(struct estimator *estimator)
 {
-    variance wide[UD_SIZE_MAX];
+    variance open[UD_SIZE_MAX];
     for (uint8_t k = 0; k < UD_SIZE_MAX; k++) {
-        wide[k] = variance_of(WIDE_SD);
+        open[k] = variance_of(WIDE_SD);
     }
-    ud_start(&estimator->covariance_m, THETA_M, wide);
-    ud_start(&estimator->covariance_h, THETA_H, wide);
+    ud_start(&estimator->covariance_m, THETA_M, open);
+    ud_start(&estimator->covariance_h, THETA_H, open);
     estimator->covariance_m.D[M_T] = VARIANCE(0);
     estimator->theta_m[M_T] = SCALAR(0);
     estimator->commissioning = true;
+    estimator->follows_m = false;
     estimator_resume(estimator);
 }
 
@@ -98,6 +99,7 @@ void estimator_operate(struct estimator *estimator, const struct estimator_param
     start_covariance(parameters->h, THETA_H, constants->scale_h, &estimator->covariance_h);
     estimator->theta_m[M_T] = parameters->m[M_T].value;
     estimator->commissioning = false;
+    estimator->follows_m = false;
     estimator_resume(estimator);
 }
 
@@ -105,16 +107,19 @@ void estimator_operate(struct estimator *estimator, const struct estimator_param
 static void start_filters(struct estimator *estimator)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
+        struct mechanics *const m = &estimator->mechanics[i];
+        struct hydraulics *const h = &estimator->hydraulics[i];
         for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
-            estimator->row_m[i][k] = (struct two_poles){0};
+            m->column[k] = (struct two_poles){0};
         }
         for (uint8_t k = 0; k <= HYDRAULIC_COLUMNS; k++) {
-            estimator->row_h[i][k] = (struct two_poles){0};
+            h->column[k] = (struct two_poles){0};
         }
-        estimator->open[i] = (struct two_poles){0};
-        estimator->previous_gate[i] = SCALAR(0);
-        estimator->strikes[i] = 0;
-        estimator->strikes_h[i] = 0;
+        m->open = (struct two_poles){0};
+        m->gate = SCALAR(0);
+        h->gate = SCALAR(0);
+        m->strikes = 0;
+        h->strikes = 0;
     }
     estimator->ramp = SCALAR(0);
 }
@@ -143,60 +148,123 @@ static void low_pass_rate(struct two_poles *filter, const struct estimator_const
     filter->second += mul(constants->filter, first - filter->second);
 }
 
-/* 0 at rest, 1 from twice the gate's rate on. */
-static scalar gate(const struct estimator_parameters *parameters, scalar reference_w)
+/* 0 at rest, 1 from twice the gate's rate on; after a start of the filters it opens with the ramp. */
+static scalar gate(const struct estimator *e, const struct estimator_parameters *parameters,
+                   const struct estimator_constants *constants, scalar reference_w)
 {
     const scalar excess = absolute(reference_w) - parameters->gate_rate;
-    return limit(quot(excess, parameters->gate_rate), SCALAR(0), SCALAR(1));
+    if (excess <= SCALAR(0)) {
+        return SCALAR(0);
+    }
+    return mul(e->ramp, excess >= parameters->gate_rate ? SCALAR(1) : amp(constants->per_gate_rate, excess));
 }
 
-/* Momentum balance of joint i over the sample (k-3/2, k-1/2), gated and filtered, Eq 25. */
-static void mechanics_balance(struct estimator *e, const struct estimator_constants *constants,
-                              const struct arm *arm, enum joint i, const struct wrist_trig *half_trig,
-                              const scalar half_w[JOINTS])
+/* This tick's sample takes the place of the oldest. */
+static void take_sample(struct estimator *e, const struct estimator_sample *sample)
 {
-    const struct estimator_sample *const at = &e->previous; /* the instant k-1, in the middle */
+    const scalar share = SCALAR(1.0 / ROW_TURNS);
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        e->window.dq[i][e->turn] = sample->dq[i];
+        e->window.torque[i][e->turn] = mul(share, mul(sample->cylinder[i].R, sample->force[i]));
+        e->window.flow[i][e->turn] = mul(share, sample->flow[i]);
+    }
+}
+
+_Static_assert(ROW_TURNS == 4, "sums of a window are written out");
+
+static scalar sum_of_window(const scalar sample[ROW_TURNS])
+{
+    return sample[0] + sample[1] + sample[2] + sample[3];
+}
+
+/* The same with the weights 1/4, 2/4, 3/4, 1, the newest last. */
+static scalar rising_sum(const scalar sample[ROW_TURNS], uint8_t newest)
+{
+    wide sum = wide_of(sample[newest]);
+    for (uint8_t n = 1; n < ROW_TURNS; n++) {
+        sum = add_product(sum, SCALAR(1.0 / ROW_TURNS) * n, sample[(newest + n) % ROW_TURNS]);
+    }
+    return narrow(sum);
+}
+
+/* Momentum balance of joint i between the middles of the last two windows, gated and filtered, Eq 25. */
+OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estimator_parameters *parameters,
+                                        const struct estimator_constants *constants, const struct arm *arm,
+                                        enum joint i, const struct estimator_sample *now)
+{
+    struct mechanics *const m = &e->mechanics[i];
+    const scalar half = SCALAR(0.5);
+    const scalar w[JOINTS] = {amp(constants->per_window, sum_of_window(e->window.dq[SWING])),
+                              amp(constants->per_window, sum_of_window(e->window.dq[WRIST]))};
+    /* the mean of two instants is the value between them to O((w T)^2) */
+    const struct wrist_trig middle = {
+        .s = mul(half, m->trig.s + now->trig.s),
+        .c = mul(half, m->trig.c + now->trig.c),
+        .r = mul(half, m->trig.r + now->trig.r),
+    };
     struct arm_row momentum;
-    arm_momentum(arm, half_trig, i, half_w, &momentum);
-    if (e->samples >= 2u) {
-        scalar middle_w[JOINTS];
-        for (uint8_t n = 0; n < JOINTS; n++) {
-            middle_w[n] = mul(SCALAR(0.5), e->previous_w[n] + half_w[n]);
-        }
+    arm_momentum(arm, &middle, i, w, &momentum);
+    const scalar rising = rising_sum(e->window.torque[i], e->turn);
+    if (e->samples > 2u * ROW_TURNS) {
+        const scalar between_w[JOINTS] = {mul(half, m->w[SWING] + w[SWING]),
+                                          mul(half, m->w[WRIST] + w[WRIST])};
         struct arm_row force;
-        arm_force(arm, &at->trig, i, middle_w, at->reference_w[i], at->lever[i], &force);
-        const struct arm_row *const before = &e->previous_momentum[i];
-        const scalar g = e->previous_gate[i];
+        arm_force(arm, &m->trig, i, between_w, m->friction_sign, m->lever, &force);
+        const scalar torque = m->torque + sum_of_window(e->window.torque[i]) - rising;
+        const struct arm_row *const before = &m->momentum;
+        const scalar g = m->gate;
+        low_pass(&m->open, constants->filter, g);
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-            low_pass_rate(&e->row_m[i][k], constants, mul(g, momentum.phi[k] - before->phi[k]),
+            low_pass_rate(&m->column[k], constants, mul(g, momentum.phi[k] - before->phi[k]),
                           mul(g, force.phi[k]));
         }
-        const scalar torque = mul(at->cylinder[i].R, at->force[i]);
-        low_pass_rate(&e->row_m[i][ROW_COLUMNS], constants, mul(g, momentum.known - before->known),
+        low_pass_rate(&m->column[ROW_COLUMNS], constants, mul(g, momentum.known - before->known),
                       mul(g, force.known - torque));
     }
-    e->previous_momentum[i] = momentum;
+    m->momentum = momentum;
+    m->w[SWING] = w[SWING];
+    m->w[WRIST] = w[WRIST];
+    m->torque = rising;
+    m->trig = now->trig;
+    m->lever = now->lever[i];
+    m->friction_sign = now->friction_sign[i];
+    m->gate = gate(e, parameters, constants, now->reference_w[i]);
 }
 
-/* Flow balance of joint i over the sample (k-1, k), gated and filtered: Eq 6 in the form of Eq 25. */
-static void hydraulics_balance(struct estimator *e, const struct estimator_parameters *parameters,
-                               const struct estimator_constants *constants, enum joint i, scalar half_w,
-                               const struct estimator_sample *now)
+/* Flow balance of joint i over the last window, gated and filtered: Eq 6 in the form of Eq 25. */
+OWN_FRAME static void hydraulics_balance(struct estimator *e, const struct estimator_parameters *parameters,
+                                         const struct estimator_constants *constants, enum joint i,
+                                         const struct estimator_sample *now)
 {
-    const struct estimator_sample *const before = &e->previous;
-    const struct cylinder_state *const c0 = &before->cylinder[i];
-    const struct cylinder_state *const c1 = &now->cylinder[i];
+    struct hydraulics *const h = &e->hydraulics[i];
     const scalar half = SCALAR(0.5);
-    const scalar noise = parameters->flow_noise[i];
-    const scalar flow_error = mul(parameters->flow_error, absolute(before->flow[i]));
-    const scalar g = mul(e->previous_gate[i], quot(noise, noise + flow_error));
-    const scalar displaced = mul(mul(half, mul(c0->lamA, c0->R) + mul(c1->lamA, c1->R)), half_w);
-    const scalar flow = mul(half, before->flow[i] + now->flow[i]);
-    struct two_poles *const row = e->row_h[i];
-    low_pass_rate(&row[0], constants, mul(g, now->force[i] - before->force[i]), SCALAR(0));
-    low_pass(&row[1], constants->filter, -mul(g, mul(half, c0->lamB + c1->lamB)));
-    low_pass(&row[2], constants->filter, -mul(g, mul(half, c0->lamC + c1->lamC)));
-    low_pass(&row[3], constants->filter, mul(g, displaced - flow));
+    const scalar lamA_R = mul(now->cylinder[i].lamA, now->cylinder[i].R);
+    const scalar lamB = now->cylinder[i].lamB;
+    const scalar lamC = now->cylinder[i].lamC;
+    const scalar flow_now = e->window.flow[i][e->turn];
+    if (e->samples > ROW_TURNS && h->gate > SCALAR(0)) {
+        /* trapezoids: of the window's ends the halves */
+        const scalar flow = sum_of_window(e->window.flow[i]) + mul(half, h->flow - flow_now);
+        const scalar noise = parameters->flow_noise[i];
+        const scalar g = mul(h->gate, quot(noise, noise + mul(parameters->flow_error, absolute(flow))));
+        const scalar w = amp(constants->per_window, sum_of_window(e->window.dq[i]));
+        const scalar displaced = mul(mul(half, h->lamA_R + lamA_R), w);
+        low_pass_rate(&h->column[0], constants, mul(g, now->force[i] - h->force), SCALAR(0));
+        low_pass(&h->column[1], constants->filter, -mul(g, mul(half, h->lamB + lamB)));
+        low_pass(&h->column[2], constants->filter, -mul(g, mul(half, h->lamC + lamC)));
+        low_pass(&h->column[3], constants->filter, mul(g, displaced - flow));
+    } else {
+        low_pass_rate(&h->column[0], constants, SCALAR(0), SCALAR(0));
+        for (uint8_t k = 1; k <= HYDRAULIC_COLUMNS; k++) {
+            low_pass(&h->column[k], constants->filter, SCALAR(0));
+        }
+    }
+    h->lamA_R = lamA_R;
+    h->lamB = lamB;
+    h->lamC = lamC;
+    h->force = now->force[i];
+    h->flow = flow_now;
+    h->gate = gate(e, parameters, constants, now->reference_w[i]);
 }
 
 /* The innovation test of the load: too large several times in a row, and the load alone is open again. */
@@ -205,11 +273,11 @@ static void notice_changed_load(struct estimator *e, const struct estimator_para
                                 variance innovation)
 {
     if (absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
-        e->strikes[i] = 0;
+        e->mechanics[i].strikes = 0;
         return;
     }
-    e->strikes[i]++;
-    if (e->strikes[i] < STRIKES) {
+    e->mechanics[i].strikes++;
+    if (e->mechanics[i].strikes < STRIKES) {
         return;
     }
     e->covariance_m.D[M_T] = constants->load_variance;
@@ -250,10 +318,10 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
                              const struct estimator_constants *constants, enum joint i)
 {
     scalar phi[THETA_M] = {0};
-    scalar residual = -e->row_m[i][ROW_COLUMNS].second;
+    scalar residual = -e->mechanics[i].column[ROW_COLUMNS].second;
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
         const uint8_t parameter = row_parameter[i][k];
-        const scalar column = e->row_m[i][k].second;
+        const scalar column = e->mechanics[i].column[k].second;
         residual -= mul(column, e->theta_m[parameter]);
         phi[parameter] = mul(column, constants->scale_m[parameter]);
     }
@@ -271,78 +339,75 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
                               const struct estimator_constants *constants, enum joint i)
 {
     scalar phi[THETA_H] = {0};
-    scalar residual = -e->row_h[i][HYDRAULIC_COLUMNS].second;
+    scalar residual = -e->hydraulics[i].column[HYDRAULIC_COLUMNS].second;
     for (uint8_t k = 0; k < HYDRAULIC_COLUMNS; k++) {
         const uint8_t parameter = hydraulic_parameter[i][k];
-        const scalar column = e->row_h[i][k].second;
+        const scalar column = e->hydraulics[i].column[k].second;
         residual -= mul(column, e->theta_h[parameter]);
         phi[parameter] = mul(column, constants->scale_h[parameter]);
     }
     const variance innovation = update_block(&e->covariance_h, phi, constants->noise_h[i], residual,
                                              constants->scale_h, parameters->h, e->theta_h);
     if (absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
-        e->strikes_h[i] = 0;
-    } else if (e->strikes_h[i] < UINT8_MAX) {
-        e->strikes_h[i]++;
+        e->hydraulics[i].strikes = 0;
+    } else if (e->hydraulics[i].strikes < UINT8_MAX) {
+        e->hydraulics[i].strikes++;
     } else {
         /* enough */
     }
 }
 
-/* sat_M: the law's estimate follows by at most `step` a tick. */
-static void rate_limit(scalar law[], const scalar theta[], const scalar step[], uint8_t size)
+/* sat_M: the law's estimate follows by at most `step` a tick. True when it is there. */
+static bool rate_limit(scalar law[], const scalar theta[], const scalar step[], uint8_t size)
 {
+    bool there = true;
     for (uint8_t k = 0; k < size; k++) {
-        law[k] += limit(theta[k] - law[k], -step[k], step[k]);
+        const scalar change = theta[k] - law[k];
+        if (absolute(change) <= step[k]) {
+            law[k] = theta[k];
+        } else {
+            law[k] += change > SCALAR(0) ? step[k] : -step[k];
+            there = false;
+        }
     }
+    return there;
 }
 
 void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
                     const struct estimator_constants *constants, const struct arm *arm,
                     const struct estimator_sample *sample)
 {
-    scalar half_w[JOINTS];
-    for (uint8_t i = 0; i < JOINTS; i++) {
-        half_w[i] = amp(constants->per_tick, sample->dq[i]);
-    }
-    if (e->samples >= 1u) {
-        /* the mean of two instants is the half step's value to O((w dt)^2) */
-        const struct wrist_trig half_trig = {
-            .s = mul(SCALAR(0.5), e->previous.trig.s + sample->trig.s),
-            .c = mul(SCALAR(0.5), e->previous.trig.c + sample->trig.c),
-            .r = mul(SCALAR(0.5), e->previous.trig.r + sample->trig.r),
-        };
-        for (uint8_t i = 0; i < JOINTS; i++) {
-            low_pass(&e->open[i], constants->filter, e->previous_gate[i]);
-            mechanics_balance(e, constants, arm, (enum joint)i, &half_trig, half_w);
-            hydraulics_balance(e, parameters, constants, (enum joint)i, half_w[i], sample);
-        }
-    }
-    if (e->samples < 2u) {
+    if (e->samples <= 2u * ROW_TURNS) {
         e->samples++;
     }
-    for (uint8_t i = 0; i < JOINTS; i++) {
-        e->previous_w[i] = half_w[i];
-        e->previous_gate[i] = mul(e->ramp, gate(parameters, sample->reference_w[i]));
-    }
-    e->ramp = smaller(e->ramp + constants->filter, SCALAR(1));
-    e->previous = *sample;
-
     const enum joint i = (enum joint)(e->turn % JOINTS);
     const bool mechanics = e->turn < JOINTS;
+    take_sample(e, sample);
+    if (!mechanics) { /* the ticks without the mechanics' update, which takes longer than all other parts of a row */
+        mechanics_balance(e, parameters, constants, arm, i, sample);
+        hydraulics_balance(e, parameters, constants, i, sample);
+    }
+    e->ramp = smaller(e->ramp + constants->ramp_step, SCALAR(1));
     e->turn = (uint8_t)((e->turn + 1u) % ROW_TURNS);
+
     e->since_update = e->since_update < ROW_TURNS ? (uint8_t)(e->since_update + 1u) : ROW_TURNS;
-    if (e->open[i].second > LEAST_OPEN && !e->held) {
+    if (e->mechanics[i].open.second > LEAST_OPEN && !e->held) {
         if (mechanics) {
             update_mechanics(e, parameters, constants, i);
+            e->follows_m = false;
         } else {
             update_hydraulics(e, parameters, constants, i);
+            e->follows_h = false;
         }
         e->since_update = 0;
     }
     e->updating = e->since_update < ROW_TURNS;
-    rate_limit(e->law_m, e->theta_m, constants->step_m, THETA_M);
-    rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
+    if (!e->follows_m) {
+        e->follows_m = rate_limit(e->law_m, e->theta_m, constants->step_m, THETA_M);
+    }
+    if (!e->follows_h) {
+        e->follows_h = rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
+    }
 }
 
 scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,

@@ -1,16 +1,22 @@
 /* The indirect half of DIARC: least squares on filtered regressions, Eq 25 and 26.
  *
- * Mechanics. Acceleration is never formed. The momentum m = row of H(q) q' is balanced over one sample,
- *     [ m_(k-1/2) - m_(k-3/2) ] / dt + f_(k-1) = R F_(k-1)                       exact to O(dt^2)
- * with the rates of the half steps straight from the encoder's increments, and f all other terms. Both sides
- * are multiplied by the same gate, 0..1, and passed through the same filter (two poles): whatever the gate and
- * the filter are, the equation still holds, so nothing of them biases the estimate.
+ * Rows in turn. There are four, mechanics and hydraulics of each joint; each tick one of them is taken into the estimate.
+ * A joint's rows are balanced over the last ROW_TURNS ticks, the window, and filtered once in that time, when it is the
+ * turn of its hydraulics: what is known changes little within a few ms, and no tick is much longer than the others.
+ *
+ * Mechanics. Acceleration is never formed. The momentum m = row of H(q) q' is balanced between the middles of two
+ * windows of length T,
+ *     [ m_(k-1/2) - m_(k-3/2) ] / T + f_(k-1) = mean R F                         exact to O(T^2)
+ * with the mean rates of the windows straight from the encoder's increments, f all other terms at the instant between
+ * the windows, and the mean of R F weighted as the difference of two means weighs a rate: rising over one window and
+ * falling over the other. Both sides are multiplied by the same gate, 0..1, and passed through the same filter (two
+ * poles): whatever the gate and the filter are, the equation still holds, so nothing of them biases the estimate.
  *
  * Gate. At low speed friction is not what the model says, and at rest it looks like load: the gate opens with
  * the reference's speed, and the estimate rests while it is shut.
  *
- * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over one sample against the flow's mean,
- *     1/be (F_k - F_(k-1)) / dt = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
+ * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over the window against the flow's mean,
+ *     1/be (F_k - F_(k-1)) / T = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
  * with QL from the measured spool; no pressure is differentiated but inside the filter. Compressibility is
  * about a hundredth of the flow, as much as a valve gain may be wrong by: so a row weighs less the more flows.
  *
@@ -18,7 +24,7 @@
  * load's variance is set back to its prior, the load's alone, and the filters start anew so that they hold
  * nothing of the old load.
  *
- * Least squares runs on UD factors, one row a tick in turn; then projection onto the bounds. The law gets the
+ * Least squares runs on UD factors; then projection onto the bounds. The law gets the
  * estimate through a rate limit: sat_M(Proj(..)). Only the load walks: its variance grows while the gate is
  * open, up to its prior (covariance bound), so that it is forgotten at a known rate and nothing winds up. */
 #ifndef CONTROL_ESTIMATOR_H
@@ -51,10 +57,16 @@ struct estimator_parameters {
     scalar innovation_limit;     /* standard deviations from which an innovation counts as too large */
 };
 
+/* Rows, and ticks from one turn of a row to its next: its window. */
+#define ROW_TURNS 4
+
 struct estimator_constants {
-    scalar filter;            /* pole step, dt / (filter_time + dt) */
-    gain filter_rate;         /* pole step / dt, 1/s */
+    scalar filter;            /* pole step, window / (filter_time + window) */
+    gain filter_rate;         /* pole step / window, 1/s */
+    scalar ramp_step;         /* dt / (filter_time + dt) */
     gain per_tick;            /* 1 / dt */
+    gain per_window;          /* 1 / window */
+    gain per_gate_rate;       /* 1 / gate_rate, s/rad */
     variance noise_m[JOINTS]; /* of a filtered row */
     variance noise_h[JOINTS];
     scalar scale_m[THETA_M]; /* high - low */
@@ -67,9 +79,10 @@ struct estimator_constants {
 
 /* What one tick measured and the reference it was measured at. */
 struct estimator_sample {
-    scalar dq[JOINTS];          /* encoder increment over the last tick, rad */
-    scalar reference_w[JOINTS]; /* qd', rad/s */
-    struct wrist_trig trig;     /* at the measured q2 */
+    scalar dq[JOINTS];            /* encoder increment over the last tick, rad */
+    scalar reference_w[JOINTS];   /* qd', rad/s */
+    scalar friction_sign[JOINTS]; /* coulomb_sign of it */
+    struct wrist_trig trig;       /* at the measured q2 */
     struct cylinder_state cylinder[JOINTS];
     scalar lever[JOINTS]; /* of friction: R over that at q = 0, or 1 */
     scalar force[JOINTS]; /* F */
@@ -79,9 +92,38 @@ struct estimator_sample {
 #define HYDRAULIC_COLUMNS 3 /* 1/be, Om2, Om3 */
 
 /* Two equal poles. A difference quotient is never formed: its sum with the first pole is kept as `step`, in units of
- * dt / pole step, and so stays as small as the steps it is made of. */
+ * window / pole step, and so stays as small as the steps it is made of. */
 struct two_poles {
     scalar step, first, second;
+};
+
+/* The samples of the last window, by turn. */
+struct window {
+    scalar dq[JOINTS][ROW_TURNS];
+    scalar torque[JOINTS][ROW_TURNS]; /* R F / ROW_TURNS */
+    scalar flow[JOINTS][ROW_TURNS];   /* the same of the flow */
+};
+
+/* A row of the mechanics. */
+struct mechanics {
+    struct two_poles column[ROW_COLUMNS + 1]; /* then the known part */
+    struct two_poles open;   /* the gate through the same filter: how much of its window it was open */
+    struct arm_row momentum; /* of the window before */
+    scalar w[JOINTS];        /* its mean rates */
+    scalar torque;           /* its R F, weighted with 1/4, 2/4 .. 1, over ROW_TURNS */
+    struct wrist_trig trig;  /* this and what follows: at its end */
+    scalar lever;
+    scalar friction_sign;
+    scalar gate;
+    uint8_t strikes; /* innovations in a row that were too large */
+};
+
+/* A row of the hydraulics. */
+struct hydraulics {
+    struct two_poles column[HYDRAULIC_COLUMNS + 1];
+    scalar lamA_R, lamB, lamC, force, flow, gate; /* at the end of the window before */
+    uint8_t
+        strikes; /* innovations in a row that were too large: sensors contradict one another; stops at 255 */
 };
 
 struct estimator {
@@ -91,24 +133,19 @@ struct estimator {
     scalar law_h[THETA_H];
     struct ud_factors covariance_m; /* in units of the ranges */
     struct ud_factors covariance_h;
-    struct two_poles row_m[JOINTS][ROW_COLUMNS + 1]; /* columns, then the known part */
-    struct two_poles row_h[JOINTS][HYDRAULIC_COLUMNS + 1];
-    struct two_poles open[JOINTS]; /* the gate through the same filter: how much of the window it was open */
-    struct estimator_sample previous;
-    scalar previous_w[JOINTS]; /* rate of the last half step */
-    struct arm_row previous_momentum[JOINTS];
-    scalar previous_gate[JOINTS];
-    scalar ramp;             /* 0..1, brings the gate up smoothly after a start of the filters */
-    uint8_t strikes[JOINTS]; /* innovations in a row that were too large */
-    uint8_t
-        strikes_h[JOINTS]; /* the same of the hydraulics; stops at 255. Sensors that contradict one another */
-    uint16_t reopened;     /* how often a changed load was noticed; stops at 65535 */
-    bool held;             /* no update: what the sensors say is in doubt */
-    bool commissioning;    /* there is no load and everything else is open */
-    uint8_t walk_updates;  /* updates since the load walked last */
-    uint8_t turn;          /* which row is updated next, 0..3 */
-    uint8_t samples;       /* since the restart, up to 2: balances need two */
-    bool updating;         /* an update was made within the last four ticks */
+    struct window window;
+    struct mechanics mechanics[JOINTS];
+    struct hydraulics hydraulics[JOINTS];
+    scalar ramp;          /* 0..1, brings the gate up smoothly after a start of the filters */
+    uint16_t reopened;    /* how often a changed load was noticed; stops at 65535 */
+    bool held;            /* no update: what the sensors say is in doubt */
+    bool commissioning;   /* there is no load and everything else is open */
+    uint8_t walk_updates; /* updates since the load walked last */
+    uint8_t turn;         /* which row is next, 0..3 */
+    uint8_t samples;      /* since the restart, up to 2 windows and one: balances need as many */
+    bool follows_m;       /* law_m is theta_m */
+    bool follows_h;
+    bool updating; /* an update was made within the last four ticks */
     uint8_t since_update;
 };
 

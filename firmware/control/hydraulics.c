@@ -27,22 +27,24 @@ struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
 struct cylinder_state cylinder_at(const struct cylinder *cylinder, const struct cylinder_constants *constants,
                                   scalar q)
 {
-    const scalar triangle = q + cylinder->q0;
-    const scalar X = cylinder_length(constants, cosine(triangle));
+    const struct sine_cosine triangle = sine_cosine(q + cylinder->q0);
+    const scalar X = cylinder_length(constants, triangle.c);
     const scalar x = limit(X - constants->X_min, SCALAR(0), constants->x_max);
     const scalar V1 = cylinder->dead_volume + mul(constants->area[BORE], x);
     const scalar V2 = cylinder->dead_volume + mul(constants->area[ANNULUS], constants->x_max - x);
     struct cylinder_state state;
-    state.R = quot(mul(constants->ab, sine(triangle)), X);
+    state.R = quot(mul(constants->ab, triangle.s), X);
     state.lamB = quot(constants->area[BORE], V1);
     state.lamC = quot(constants->area[ANNULUS], V2);
-    state.lamA = mul(constants->area[BORE], state.lamB) + mul(constants->area[ANNULUS], state.lamC);
+    state.lamA = narrow(add_product(add_product(wide_of(SCALAR(0)), constants->area[BORE], state.lamB),
+                                    constants->area[ANNULUS], state.lamC));
     return state;
 }
 
 scalar cylinder_force(const struct cylinder_constants *constants, const scalar p[CHAMBERS])
 {
-    return mul(p[BORE], constants->area[BORE]) - mul(p[ANNULUS], constants->area[ANNULUS]);
+    const wide force = add_product(wide_of(SCALAR(0)), p[BORE], constants->area[BORE]);
+    return narrow(subtract_product(force, p[ANNULUS], constants->area[ANNULUS]));
 }
 
 scalar valve_gain(const struct cylinder *cylinder, const struct supply *supply,
@@ -56,7 +58,7 @@ scalar valve_gain(const struct cylinder *cylinder, const struct supply *supply,
 }
 
 /* Opening over which the inverse of the overlap is smoothed. */
-#define OVERLAP_BLEND SCALAR(0.005)
+#define PER_OVERLAP_BLEND GAIN(1 / 0.005)
 
 scalar valve_opening(const struct cylinder *cylinder, scalar spool)
 {
@@ -65,7 +67,7 @@ scalar valve_opening(const struct cylinder *cylinder, scalar spool)
 
 scalar valve_spool(const struct cylinder *cylinder, scalar opening)
 {
-    const scalar side = limit(quot(opening, OVERLAP_BLEND), SCALAR(-1), SCALAR(1));
+    const scalar side = limit(amp(PER_OVERLAP_BLEND, opening), SCALAR(-1), SCALAR(1));
     return opening + mul(cylinder->overlap, side);
 }
 

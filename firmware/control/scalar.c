@@ -4,22 +4,24 @@
 #define HALF_PI SCALAR(1.57079632679489661923)
 #define TWO_PI SCALAR(6.28318530717958647692)
 
-scalar sine(scalar x)
+struct sine_cosine sine_cosine(scalar x)
 {
     if (x > PI) {
         x = x - TWO_PI;
     } else if (x < -PI) {
         x = x + TWO_PI;
     }
-    if (x > HALF_PI) {
-        x = PI - x;
-    } else if (x < -HALF_PI) {
-        x = -PI - x;
-    }
-    return sine_quarter(x);
+    const scalar a = absolute(x);
+    const scalar s = sine_quarter(a > HALF_PI ? PI - a : a);
+    return (struct sine_cosine){.s = x < SCALAR(0) ? -s : s, .c = sine_quarter(HALF_PI - a)};
+}
+
+scalar sine(scalar x)
+{
+    return sine_cosine(x).s;
 }
 
 scalar cosine(scalar x)
 {
-    return sine(x < SCALAR(0) ? HALF_PI + x : HALF_PI - x);
+    return sine_cosine(x).c;
 }

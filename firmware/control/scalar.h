@@ -15,6 +15,7 @@
  * gain      in 1/s or 1/s^2: hundreds where a scalar is of order one; amp() is its product with a scalar
  * variance  of an estimate, between 0 and 1 of a range squared: small where a scalar is of order one
  * inverse   of a variance, ready to multiply by
+ * wide      a sum of products before it is rounded: narrow(add_product(wide_of(c), a, b)) is c + a b
  *
  * SCALAR(real), GAIN(real), VARIANCE(real): constants written as real numbers. */
 #if defined(DIARC_SCALAR_DOUBLE) || defined(DIARC_SCALAR_FLOAT)
@@ -24,11 +25,6 @@
 #else
 #error "choose the number type: DIARC_SCALAR_DOUBLE, DIARC_SCALAR_FLOAT or DIARC_SCALAR_FIXED"
 #endif
-
-static inline scalar absolute(scalar x)
-{
-    return x < SCALAR(0) ? -x : x;
-}
 
 static inline scalar smaller(scalar a, scalar b)
 {
@@ -49,6 +45,9 @@ static inline scalar limit(scalar x, scalar low, scalar high)
     return x > high ? high : x;
 }
 
+/* A function whose variables must not lie on the stack below what its caller calls besides it. */
+#define OWN_FRAME __attribute__((noinline))
+
 /* The number type's own sine, |x| <= pi/2. */
 scalar sine_quarter(scalar x);
 
@@ -56,6 +55,12 @@ scalar sine_quarter(scalar x);
  * pi and fixed). */
 scalar sine(scalar x);
 scalar cosine(scalar x);
+
+/* Both at once. */
+struct sine_cosine {
+    scalar s, c;
+};
+struct sine_cosine sine_cosine(scalar x);
 
 /* Arctangent of y / x in rad, x > 0, -pi/2..pi/2. Error at most 7e-16 (double), 1.5e-7 (float and fixed);
  * as a ratio it needs no quotient beyond 1. */
@@ -75,5 +80,8 @@ gain gain_from_real32(uint32_t bits, int8_t exponent);
 /* Whether the type holds such a number with the room that sums and products need. */
 bool scalar_holds_real32(uint32_t bits, int8_t exponent);
 bool gain_holds_real32(uint32_t bits, int8_t exponent);
+
+/* The binary32 bits of x * 2^exponent, to the nearest, halves to even; |exponent| <= 96. */
+uint32_t real32_from_scalar(scalar x, int8_t exponent);
 
 #endif

@@ -30,7 +30,7 @@ static scalar odd_polynomial(const int32_t *coefficient, int32_t x)
     for (uint8_t k = TERMS - 1; k > 0; k--) {
         p = (int32_t)(((int64_t)p * y) >> ARGUMENT_FRACTION) + coefficient[k - 1];
     }
-    return fixed_product(p, x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
+    return fixed_shifted((int64_t)p * x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
 }
 
 scalar sine_quarter(scalar x)
@@ -108,27 +108,48 @@ int32_t fixed_quotient(int32_t a, int32_t b, uint8_t shift, int32_t most)
     return (a < 0) != (b < 0) ? -quotient : quotient;
 }
 
+scalar quot(scalar a, scalar b)
+{
+    if (b == 0) {
+        return a < 0 ? -FIXED_LIMIT : FIXED_LIMIT;
+    }
+    const inverse i = invert(b < 0 ? -b : b);
+    const scalar quotient = fixed_scaled(a, i.mantissa, 62 - SCALAR_FRACTION - i.shift);
+    return b < 0 ? -quotient : quotient;
+}
+
 scalar fraction(uint32_t part, uint32_t whole)
 {
     return (scalar)divide((uint64_t)part << SCALAR_FRACTION, whole);
 }
 
-/* floor(sqrt(x)), 0 < x < 2^60. Newton's iteration from above: it falls until it is there. */
+/* floor(sqrt(x)), 2^30 <= x. The upper 8 bits by Newton from a line, the lower from the remainder, as in long division:
+ * never too small, at most one too large (Zimmermann, Karatsuba Square Root, 1999). */
+static uint32_t root_of_word(uint32_t x)
+{
+    const uint32_t top = x >> 16; /* 2^14..2^16 */
+    uint32_t upper = (top >> 9) + 112u;
+    upper = (upper + top / upper) >> 1;
+    upper = (upper + top / upper) >> 1; /* at most one too large */
+    upper -= upper * upper > top ? 1u : 0u;
+    const uint32_t rest = (top - upper * upper) << 8 | (x >> 8 & 0xFFu);
+    const uint32_t root = (upper << 8) + rest / (2u * upper);
+    return root > 0xFFFFu || root * root > x ? root - 1u : root;
+}
+
+/* floor(sqrt(x)), 0 < x < 2^62: 16 bits of the root by 16. */
 static uint32_t integer_root(uint64_t x)
 {
-    const uint32_t high = (uint32_t)(x >> 32);
-    const uint8_t zeros = high != 0u ? leading_zeros(high) : (uint8_t)(32u + leading_zeros((uint32_t)x));
-    const uint8_t half = (uint8_t)((64u - zeros + 1u) / 2u); /* x < 2^(2 half) */
-    /* a line just above the root's tangent: (t + 1/2) 23/32 >= sqrt(t), at most 8 % above for t = 1/4..1 */
-    const uint32_t top = (uint32_t)((x << (62u - 2u * half)) >> 32); /* x 2^(30 - 2 half), 2^28..2^30 */
-    uint32_t guess = (uint32_t)((((uint64_t)top + ((uint64_t)1 << 29)) * 23u >> 5) >> (30u - half)) + 1u;
-    for (;;) {
-        const uint32_t next = (uint32_t)(((uint64_t)guess + divide(x, guess)) >> 1);
-        if (next >= guess) {
-            return guess;
-        }
-        guess = next;
-    }
+    const uint32_t above = (uint32_t)(x >> 32);
+    const uint8_t zeros = above != 0u ? leading_zeros(above) : (uint8_t)(32u + leading_zeros((uint32_t)x));
+    const uint8_t shift = zeros & 0xFEu; /* even: half of it is the root's */
+    const uint64_t normal = x << shift;
+    const uint32_t high = (uint32_t)(normal >> 32);
+    const uint32_t upper = root_of_word(high);
+    const uint32_t rest = high - upper * upper; /* up to 17 bits: both sides of the quotient are halved */
+    const uint64_t root = ((uint64_t)upper << 16) + (rest << 15 | (uint32_t)normal >> 17) / upper;
+    const bool too_large = root > UINT32_MAX || root * root > normal;
+    return (uint32_t)((too_large ? root - 1u : root) >> (shift / 2u));
 }
 
 scalar root(scalar x)
@@ -146,15 +167,29 @@ inverse invert(variance v)
 {
     const uint8_t shift = leading_zeros((uint32_t)v);
     const uint32_t normal = (uint32_t)v << shift; /* 2^31..2^32 - 1 */
-    const uint32_t mantissa = divide((uint64_t)1 << 62, normal);
-    return (inverse){.mantissa = mantissa > INT32_MAX ? INT32_MAX : (int32_t)mantissa, .shift = shift};
+    /* the first 15 bits of 2^62 / normal by division, twice as many by Newton, the last ones by what is left over */
+    const uint32_t guess = UINT32_MAX / (normal >> 16) << 14;
+    const int64_t missing = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * guess);
+    const uint32_t better = guess + (uint32_t)(((missing >> 32) * (int64_t)guess) >> 30);
+    const int64_t left = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * better);
+    const uint32_t mantissa = better + (uint32_t)(left >> 32);
+    return (inverse){.mantissa = mantissa > INT32_MAX ? INT32_MAX : (int32_t)mantissa,
+                     .shift = (int8_t)shift};
+}
+
+inverse scale_inverse(inverse i, scalar f)
+{
+    const uint8_t bits = f == 0 ? 0u : (uint8_t)(32u - leading_zeros(magnitude_of(f)));
+    const int32_t shift = i.shift + bits - SCALAR_FRACTION;
+    return (inverse){.mantissa = (int32_t)(((int64_t)i.mantissa * f) >> bits),
+                     .shift = (int8_t)(shift < INVERSE_SHIFT_MOST ? shift : INVERSE_SHIFT_MOST)};
 }
 
 scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
 {
     return fraction_bits <= SCALAR_FRACTION
                ? fixed_saturate((int64_t)raw * ((int64_t)1 << (SCALAR_FRACTION - fraction_bits)))
-               : fixed_product(raw, 1, (uint8_t)(fraction_bits - SCALAR_FRACTION));
+               : fixed_shifted(raw, (uint8_t)(fraction_bits - SCALAR_FRACTION));
 }
 
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high)
@@ -181,10 +216,10 @@ static int32_t from_real32(uint32_t bits, int16_t exponent, uint8_t fraction_bit
     if (shift > 30) {
         magnitude = mantissa == 0 ? 0 : INT32_MAX;
     } else if (shift >= 0) {
-        const int64_t wide = (int64_t)mantissa * ((int64_t)1 << shift);
-        magnitude = wide > INT32_MAX ? INT32_MAX : (int32_t)wide;
+        const int64_t whole = (int64_t)mantissa * ((int64_t)1 << shift);
+        magnitude = whole > INT32_MAX ? INT32_MAX : (int32_t)whole;
     } else if (shift >= -31) {
-        magnitude = fixed_product(mantissa, 1, (uint8_t)-shift);
+        magnitude = fixed_shifted(mantissa, (uint8_t)-shift);
     } else {
         magnitude = 0;
     }
@@ -215,6 +250,24 @@ scalar scalar_from_real32(uint32_t bits, int8_t exponent)
 gain gain_from_real32(uint32_t bits, int8_t exponent)
 {
     return from_real32(bits, exponent, GAIN_FRACTION);
+}
+
+uint32_t real32_from_scalar(scalar x, int8_t exponent)
+{
+    uint32_t magnitude = magnitude_of(x);
+    if (magnitude == 0u) {
+        return 0;
+    }
+    const uint32_t sign = x < 0 ? 0x80000000u : 0u;
+    const uint8_t zeros = leading_zeros(magnitude);
+    /* normalised, 32 bits: 24 of them stay */
+    magnitude <<= zeros;
+    const uint32_t rest = magnitude & 0xFFu;
+    uint32_t mantissa = magnitude >> 8;
+    mantissa += rest > 0x80u || (rest == 0x80u && (mantissa & 1u) != 0u) ? 1u : 0u;
+    /* value = mantissa * 2^(8 - zeros - fraction + exponent); the mantissa's first bit adds one to the field */
+    const int16_t field = (int16_t)(exponent - SCALAR_FRACTION + 8 - zeros + 149);
+    return sign | (((uint32_t)field << 23) + mantissa);
 }
 
 #endif

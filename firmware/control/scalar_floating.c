@@ -31,12 +31,12 @@ static const scalar ARCTANGENT[] = {
 };
 #endif
 
-static scalar odd_polynomial(const scalar *coefficient, uint8_t terms, scalar x)
+static inline scalar odd_polynomial(const scalar *coefficient, uint8_t terms, scalar x)
 {
     const scalar y = mul(x, x);
     scalar p = coefficient[terms - 1];
     for (uint8_t k = (uint8_t)(terms - 1); k > 0; k--) {
-        p = mul(p, y) + coefficient[k - 1];
+        p = narrow(add_product(wide_of(coefficient[k - 1]), p, y));
     }
     return mul(p, x);
 }
@@ -121,6 +121,41 @@ bool gain_holds_real32(uint32_t bits, int8_t exponent)
 gain gain_from_real32(uint32_t bits, int8_t exponent)
 {
     return scalar_from_real32(bits, exponent);
+}
+
+/* binary32: 24 bits of mantissa; the smallest step is 2^-149, the largest number below 2^24 * 2^104. */
+#define REAL32_MANTISSA_END SCALAR(16777216)
+#define REAL32_EXPONENT_LOW (-149)
+#define REAL32_EXPONENT_HIGH 104
+#define REAL32_INFINITY 0x7F800000u
+#define REAL32_NAN 0x7FC00000u
+
+uint32_t real32_from_scalar(scalar x, int8_t exponent)
+{
+    const uint32_t sign = x < SCALAR(0) ? 0x80000000u : 0u;
+    scalar magnitude = absolute(x);
+    int16_t step = exponent; /* the number is magnitude * 2^step */
+    if (!(magnitude >= SCALAR(0))) {
+        return REAL32_NAN;
+    }
+    while (magnitude >= REAL32_MANTISSA_END && step <= REAL32_EXPONENT_HIGH) {
+        magnitude = magnitude * SCALAR(0.5);
+        step++;
+    }
+    while (magnitude < REAL32_MANTISSA_END * SCALAR(0.5) && step > REAL32_EXPONENT_LOW) {
+        magnitude = magnitude * SCALAR(2);
+        step--;
+    }
+    if (step > REAL32_EXPONENT_HIGH) {
+        return sign | REAL32_INFINITY;
+    }
+    uint32_t mantissa = (uint32_t)magnitude;
+    const scalar rest = magnitude - (scalar)mantissa;
+    const bool odd = (mantissa & 1u) != 0u;
+    mantissa += rest > SCALAR(0.5) || (rest >= SCALAR(0.5) && odd) ? 1u : 0u;
+    /* The first bit of a normal number adds one to the exponent's field, a carry out of the mantissa another one; so
+     * subnormals, and a sum that becomes infinite, come out right by themselves. */
+    return sign | (((uint32_t)(step - REAL32_EXPONENT_LOW) << 23) + mantissa);
 }
 
 #endif

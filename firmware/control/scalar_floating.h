@@ -13,13 +13,27 @@ typedef float scalar;
 #define SCALAR_NAME "float"
 #endif
 
+/* Before loops of a few passes: registers for a row of numbers are there, and the passes are short. */
+#define UNROLLS_SHORT_LOOPS true
+#define UNROLL_SHORT_LOOP _Pragma("GCC unroll 9")
+
 typedef scalar gain;
 typedef scalar variance;
 typedef scalar inverse;
+typedef scalar wide;
 
 #define SCALAR(real) ((scalar)(real))
 #define GAIN(real) ((gain)(real))
 #define VARIANCE(real) ((variance)(real))
+
+static inline scalar absolute(scalar x)
+{
+#if defined(DIARC_SCALAR_DOUBLE)
+    return __builtin_fabs(x);
+#else
+    return __builtin_fabsf(x);
+#endif
+}
 
 static inline scalar mul(scalar a, scalar b)
 {
@@ -56,6 +70,32 @@ static inline variance add_variance(variance a, variance b)
     return a + b;
 }
 
+static inline wide wide_of(scalar x)
+{
+    return x;
+}
+
+/* In float one instruction of a microcontroller with FPU, rounded once, and so on a host, by its instruction or by libm.
+ * In double, the reference, a host's compiler may have neither at hand. */
+static inline wide add_product(wide sum, scalar a, scalar b)
+{
+#if defined(DIARC_SCALAR_DOUBLE)
+    return sum + a * b;
+#else
+    return __builtin_fmaf(a, b, sum);
+#endif
+}
+
+static inline wide subtract_product(wide sum, scalar a, scalar b)
+{
+    return add_product(sum, -a, b);
+}
+
+static inline scalar narrow(wide sum)
+{
+    return sum;
+}
+
 static inline scalar fraction(uint32_t part, uint32_t whole)
 {
     return (scalar)part / (scalar)whole;
@@ -68,6 +108,12 @@ static inline scalar root(scalar x)
 #else
     return x > SCALAR(0) ? __builtin_sqrtf(x) : SCALAR(0);
 #endif
+}
+
+/* v + w f */
+static inline variance add_scaled_variance(variance v, variance w, scalar f)
+{
+    return add_product(v, w, f);
 }
 
 static inline variance variance_of(scalar sd)
@@ -88,6 +134,11 @@ static inline variance scale_variance(variance v, scalar f)
 static inline inverse invert(variance v)
 {
     return SCALAR(1) / v;
+}
+
+static inline inverse scale_inverse(inverse i, scalar f)
+{
+    return i * f;
 }
 
 static inline gain variance_ratio(variance v, inverse i)

@@ -1,9 +1,9 @@
 #include "control/ud_factors.h"
 
 /* Where column j of U begins. */
-static uint8_t column(uint8_t j)
+static inline uint8_t column(uint8_t j)
 {
-    return (uint8_t)(j * (j - 1) / 2);
+    return j > 0u ? (uint8_t)(j * (j - 1u) / 2u) : (uint8_t)0;
 }
 
 void ud_start(struct ud_factors *ud, uint8_t size, const variance prior[])
@@ -14,33 +14,60 @@ void ud_start(struct ud_factors *ud, uint8_t size, const variance prior[])
     }
 }
 
-variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, gain K[])
+/* Column j of the update: f = U' phi and v = D f of it, then what it tells of the columns before. Returns alpha. */
+static inline variance update_column(variance *D, scalar Uj[], uint8_t j, const scalar phi[], variance alpha,
+                                     inverse *alpha_inverse, variance P_phi[])
+{
+    wide sum = wide_of(phi[j]);
+    UNROLL_SHORT_LOOP
+    for (uint8_t i = 0; i < j; i++) {
+        sum = add_product(sum, Uj[i], phi[i]);
+    }
+    const scalar f = narrow(sum);
+    const variance v = scale_variance(*D, f);
+    P_phi[j] = v;
+    const inverse f_over_alpha = scale_inverse(*alpha_inverse, f);
+    UNROLL_SHORT_LOOP
+    for (uint8_t i = 0; i < j; i++) {
+        const scalar u = Uj[i];
+        const variance p = P_phi[i];
+        P_phi[i] = add_scaled_variance(p, v, u);
+        Uj[i] = add_limited(u, -variance_share(p, f_over_alpha));
+    }
+    const variance alpha_after = add_scaled_variance(alpha, v, f);
+    *alpha_inverse = invert(alpha_after);
+    *D = scale_variance(*D, variance_share(alpha, *alpha_inverse));
+    return alpha_after;
+}
+
+/* Written once, compiled for each size that is in use: where its loops are unrolled, nothing of them is left but the
+ * arithmetic. */
+static inline variance update(struct ud_factors *ud, uint8_t size, const scalar phi[], variance noise,
+                              gain K[])
 {
     variance P_phi[UD_SIZE_MAX];
     variance alpha = noise; /* variance of the noise, then of the innovation as columns are added */
     inverse alpha_inverse = invert(alpha);
-    for (uint8_t j = 0; j < ud->size; j++) {
-        scalar *const Uj = j > 0 ? &ud->U[column(j)] : ud->U;
-        scalar f = phi[j]; /* f = U' phi */
-        for (uint8_t i = 0; i < j; i++) {
-            f = add_limited(f, mul(Uj[i], phi[i]));
-        }
-        const variance v = scale_variance(ud->D[j], f); /* v = D f */
-        const variance alpha_before = alpha;
-        alpha = add_variance(alpha, scale_variance(v, f));
-        for (uint8_t i = 0; i < j; i++) {
-            const scalar u = Uj[i];
-            Uj[i] = add_limited(u, -amp(variance_ratio(P_phi[i], alpha_inverse), f));
-            P_phi[i] = add_variance(P_phi[i], scale_variance(v, u));
-        }
-        P_phi[j] = v;
-        alpha_inverse = invert(alpha);
-        ud->D[j] = scale_variance(ud->D[j], variance_share(alpha_before, alpha_inverse));
+    UNROLL_SHORT_LOOP
+    for (uint8_t j = 0; j < size; j++) {
+        alpha = update_column(&ud->D[j], &ud->U[column(j)], j, phi, alpha, &alpha_inverse, P_phi);
     }
-    for (uint8_t j = 0; j < ud->size; j++) {
+    UNROLL_SHORT_LOOP
+    for (uint8_t j = 0; j < size; j++) {
         K[j] = variance_ratio(P_phi[j], alpha_inverse);
     }
     return alpha;
+}
+
+variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, gain K[])
+{
+    if (UNROLLS_SHORT_LOOPS && ud->size == UD_SIZE_MAX) {
+        return update(ud, UD_SIZE_MAX, phi, noise, K);
+    }
+    if (UNROLLS_SHORT_LOOPS && ud->size == UD_SIZE_SHORT) {
+        return update(ud, UD_SIZE_SHORT, phi, noise, K);
+    }
+    return update(ud, ud->size, phi, noise, K);
 }
 
 variance ud_variance(const struct ud_factors *ud, uint8_t k)

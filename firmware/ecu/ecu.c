@@ -8,7 +8,8 @@
 
 #define SYNC_COUNTER_LAST 240u /* CiA 301, 1019h */
 #define SLOW_CYCLE_TICKS 10u   /* one slow frame in each of these phases, never two in a tick */
-#define HEARTBEAT_US 100000u
+#define HEARTBEAT_MS 100u
+#define US_PER_MS 1000u
 #define US_PER_S 1000000u
 #define NODE_ALL 0u
 #define CONSUMER_DEFAULT 0x000201F4u /* the I/O node, 500 ms */
@@ -28,7 +29,8 @@ static void count_u16(uint16_t *counter)
     }
 }
 
-/* Back to the state of power-on; parameters stay. Field by field: a copy of the whole would need its size in stack. */
+/* Back to the state of power-on; parameters stay, and valves_active: when the bus did not take the frame that shuts
+ * them it is sent again. Field by field: a copy of the whole would need its size in stack. */
 static void restart(struct ecu *ecu)
 {
     ecu->mode = MODE_INIT;
@@ -42,7 +44,6 @@ static void restart(struct ecu *ecu)
     ecu->sampled = false;
     ecu->restart_requested = false;
     ecu->boot_up_due = true;
-    ecu->valves_active = false;
     ecu->is_pending = false;
     ecu->pending = EVENT_STANDBY;
     ecu->requested_controller = CONTROLLER_DIARC;
@@ -55,8 +56,12 @@ static void restart(struct ecu *ecu)
     ecu->next_page = 0;
     ecu->next_bucket = 0;
     ecu->next_joint = 0;
-    ecu->heartbeat_ticks = 0;
-    for (uint8_t k = 0; k < ECU_TX_COUNTERS; k++) {
+    ecu->heartbeat_ms = HEARTBEAT_MS;
+    /* not right behind boot-up: clients that wait for that look at the last one that came */
+    ecu->heartbeat_ticks = HEARTBEAT_MS * US_PER_MS / ecu->period_us;
+    ecu->refused_parameter = NO_PARAMETER;
+    sdo_server_start(ecu);
+    for (uint8_t k = 0; k < TX_FRAMES; k++) {
         ecu->tx_counter[k] = 0;
     }
     ecu->complete_at_us = 0;
@@ -69,8 +74,8 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
                          uint16_t *entry)
 {
     *ecu = (struct ecu){0};
-    const enum ecu_status status =
-        parameters_load(&ecu->machine, &ecu->bases, image != NULL ? image : &default_parameter_image, entry);
+    ecu->image = image != NULL ? *image : default_parameter_image;
+    const enum ecu_status status = parameters_load(&ecu->machine, &ecu->bases, &ecu->image, entry);
     if (status != ECU_OK) {
         return status;
     }
@@ -83,6 +88,24 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
     ecu->constants = controller_constants(&ecu->machine, dt_s);
     restart(ecu);
     return ECU_OK;
+}
+
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry)
+{
+    enum store_status stored = store != NULL ? store_load(store, buffer) : STORE_EMPTY;
+    const bool found = stored == STORE_OK || stored == STORE_OLDER;
+    enum ecu_status status = ECU_OK;
+    if (found) {
+        status = ecu_init(ecu, buffer, period_us, entry);
+    }
+    if (!found || status != ECU_OK) {
+        stored = found ? STORE_FOREIGN : stored;
+        status = ecu_init(ecu, fallback, period_us, entry);
+    }
+    ecu->stored = stored;
+    return status;
 }
 
 static void send_valves(struct ecu *ecu, const struct ecu_port *port)
@@ -115,6 +138,9 @@ void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
     if (ecu->boot_up_due) {
         (void)transmit_send(ecu, port, transmit_heartbeat(0));
         ecu->boot_up_due = false;
+        if (ecu->stored != STORE_OK && ecu->stored != STORE_EMPTY) {
+            fault_raise(ecu, port, FAULT_STORE_DAMAGED);
+        }
     }
     ecu->sync_counter = (uint8_t)(ecu->sync_counter % SYNC_COUNTER_LAST + 1u);
     receive_begin_tick(&ecu->receive, ecu->sync_counter);
@@ -150,6 +176,10 @@ static void receive_frame(struct ecu *ecu, const struct ecu_port *port, const st
         nmt_command(ecu, port, frame);
         return;
     }
+    if (frame->id == SDO_REQUEST_ID) {
+        sdo_server_receive(ecu, frame);
+        return;
+    }
     enum received_frame which = RX_FRAMES;
     const enum receive_result result = receive_accept(&ecu->receive, frame, &which);
     if (result == RECEIVE_ALIEN) {
@@ -169,6 +199,9 @@ bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
     for (uint8_t n = 0; n < UINT8_MAX && port->receive(port->context, &frame) == PORT_OK; n++) {
         receive_frame(ecu, port, &frame);
     }
+    if (!ecu->valves_active) {
+        sdo_server_send(ecu, port); /* no valve waits for this tick */
+    }
     const bool complete = receive_complete(&ecu->receive);
     if (complete && !was_complete) {
         ecu->complete_at_us = port->now_us(port->context);
@@ -186,6 +219,21 @@ static void tare_sample(struct ecu *ecu)
     if (result == TARE_REFUSED) {
         request_refused(ecu, REFUSAL_NOT_DEPRESSURISED);
     }
+}
+
+static void send_heartbeat(struct ecu *ecu, const struct ecu_port *port)
+{
+    const uint32_t cycle = ecu->heartbeat_ms * US_PER_MS / ecu->period_us;
+    if (ecu->heartbeat_ms == 0u) {
+        ecu->heartbeat_ticks = 0;
+        return;
+    }
+    const bool shortened = ecu->heartbeat_ticks > cycle;
+    if (ecu->heartbeat_ticks == 0u || shortened) {
+        (void)transmit_send(ecu, port, transmit_heartbeat((uint8_t)ecu->nmt));
+        ecu->heartbeat_ticks = cycle > 0u ? cycle : 1u;
+    }
+    ecu->heartbeat_ticks--;
 }
 
 static void send_slow_frames(struct ecu *ecu, const struct ecu_port *port)
@@ -212,6 +260,11 @@ static void send_slow_frames(struct ecu *ecu, const struct ecu_port *port)
 /* Samples, supervision, law. */
 static void work(struct ecu *ecu, const struct ecu_port *port)
 {
+    if (parameter_set_coming(ecu)) { /* no machine to judge samples by; the valves are shut */
+        controller_gap(&ecu->controller);
+        supervise_bus(ecu, port);
+        return;
+    }
     const struct sensor_samples before = ecu->samples;
     const enum ecu_fault wrong = samples_take(ecu);
     const bool good = wrong == FAULT_NONE;
@@ -253,11 +306,9 @@ void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
     } else {
         shut_valves(ecu, port);
     }
-    if (ecu->heartbeat_ticks == 0u) {
-        (void)transmit_send(ecu, port, transmit_heartbeat((uint8_t)ecu->nmt));
-        ecu->heartbeat_ticks = (uint16_t)(HEARTBEAT_US / ecu->period_us);
-    }
-    ecu->heartbeat_ticks--;
+    send_heartbeat(ecu, port);
+    sdo_server_send(ecu, port);
+    sdo_server_tick(ecu);
     ecu->phase = (uint8_t)((ecu->phase + 1u) % SLOW_CYCLE_TICKS);
     ecu->counters.ticks++;
 }

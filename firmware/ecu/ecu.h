@@ -10,13 +10,17 @@
 #define ECU_ECU_H
 
 #include "control/safe_stop.h"
+#include "ecu/emergency.h"
 #include "ecu/faults.h"
 #include "ecu/modes.h"
+#include "ecu/parameter_set.h"
 #include "ecu/parameters.h"
 #include "ecu/port.h"
 #include "ecu/receive_table.h"
 #include "ecu/requests.h"
 #include "ecu/samples.h"
+#include "ecu/sdo_server.h"
+#include "ecu/store.h"
 #include "ecu/supervision.h"
 #include "ecu/tare.h"
 #include "ecu/time_histogram.h"
@@ -37,15 +41,20 @@ struct ecu_counters {
     struct time_histogram tick_times; /* of these */
 };
 
-#define ECU_TX_COUNTERS 5
+/* Frames with E2E protection, by who counts them. */
+enum sent_frame { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING, TX_FRAMES };
 
 /* All of the ECU; a port owns one and looks into it only to report. */
 struct ecu {
-    struct machine machine;
+    struct parameter_image
+        image; /* the set in force, from which all of machine, bases and constants follow */
+    struct parameter_set_coming coming;
+    struct machine machine; /* not there while a set is coming: parameter_set.h */
     struct bases bases;
     struct controller_constants constants;
     struct controller controller;
     uint32_t period_us;
+    enum store_status stored; /* STORE_OK again once its fault is reset */
     enum ecu_mode mode;
     enum nmt_state nmt;
     enum ecu_fault fault;   /* the one to show: the first of the active ones */
@@ -68,9 +77,14 @@ struct ecu {
     uint8_t sync_counter;        /* 1..240 */
     uint8_t phase;               /* tick modulo the slow frames' cycle */
     uint8_t next_parameter, next_page, next_bucket, next_joint;
-    uint16_t heartbeat_ticks; /* to the next heartbeat */
-    uint8_t tx_counter[ECU_TX_COUNTERS];
-    uint32_t complete_at_us; /* when the last sensor frame of this tick came */
+    uint16_t heartbeat_ms;      /* object 1017h; 0: none is sent */
+    uint32_t heartbeat_ticks;   /* to the next heartbeat */
+    uint16_t refused_parameter; /* object 200Eh */
+    struct emergency_history emergencies;
+    struct sdo_server sdo;
+    uint8_t tx_counter[TX_FRAMES];
+    uint8_t sent[TX_FRAMES][8]; /* data of the last frame of each */
+    uint32_t complete_at_us;    /* when the last sensor frame of this tick came */
     struct ecu_counters counters;
 };
 
@@ -78,6 +92,13 @@ struct ecu {
  * not usable, and with ECU_PARAMETER_RANGE *entry is the parameter's number (parameter_name). */
 enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, uint32_t period_us,
                          uint16_t *entry);
+
+/* The same from what is stored. `fallback` (NULL: the reference arm) is used when nothing is, and also when what is
+ * stored is damaged or this firmware refuses it; the latter, or an older set than the last one saved, is fault
+ * STORE_DAMAGED. `store` NULL: nothing survives. *buffer is overwritten. */
+enum ecu_status ecu_init_stored(struct ecu *ecu, const struct store_port *store,
+                                struct parameter_image *buffer, const struct parameter_image *fallback,
+                                uint32_t period_us, uint16_t *entry);
 
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port);
 bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port);

@@ -47,6 +47,12 @@ uint8_t fault_error_register(const struct ecu *ecu)
     return bits;
 }
 
+static void send_emergency(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault fault)
+{
+    emergency_note(&ecu->emergencies, fault_table[fault].emergency, (uint8_t)fault);
+    (void)transmit_send(ecu, port, transmit_emergency(ecu, fault));
+}
+
 /* The one that TIMING shows: the first to come, and when it is gone any other. */
 static void choose_shown(struct ecu *ecu)
 {
@@ -73,7 +79,7 @@ void fault_raise(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault fa
         (stops && fault_table[ecu->fault].reaction == (uint8_t)REACTION_DEGRADE)) {
         ecu->fault = fault;
     }
-    (void)transmit_send(ecu, port, transmit_emergency(ecu, fault));
+    send_emergency(ecu, port, fault);
     switch ((enum fault_reaction)fault_table[fault].reaction) {
     case REACTION_SAFE_STOP:
         (void)operation_event(ecu, EVENT_FAULT_STOP);
@@ -93,7 +99,7 @@ static void after_clearing(struct ecu *ecu, const struct ecu_port *port)
     choose_shown(ecu);
     ecu->controller.estimator.held = any_active(ecu, true);
     if (ecu->active_faults == 0u) {
-        (void)transmit_send(ecu, port, transmit_emergency(ecu, FAULT_NONE));
+        send_emergency(ecu, port, FAULT_NONE);
     }
 }
 

@@ -10,7 +10,7 @@ static struct mode_conditions conditions_of(const struct ecu *ecu)
         .operational = ecu->nmt == NMT_OPERATIONAL,
         .sensors_good = ecu->sampled && ecu->supervision.sensors_wrong == 0u,
         .fault_active = fault_stops(ecu),
-        .cause_gone = supervision_cause_gone(ecu),
+        .cause_gone = !parameter_set_coming(ecu) && supervision_cause_gone(ecu),
     };
 }
 

@@ -2,6 +2,9 @@
 
 #include <stddef.h>
 
+#include "ecu/crc32.h"
+#include "ecu/little_endian.h"
+
 enum parameter_kind { PARAMETER_SCALAR, PARAMETER_GAIN };
 
 struct parameter_entry {
@@ -20,23 +23,7 @@ const struct parameter_image default_parameter_image = {{
 }};
 
 #define HEADER_BYTES 12u
-
-static uint32_t read_u32(const uint8_t *bytes)
-{
-    return (uint32_t)bytes[0] | (uint32_t)bytes[1] << 8 | (uint32_t)bytes[2] << 16 | (uint32_t)bytes[3] << 24;
-}
-
-static uint32_t crc32(const uint8_t *bytes, uint32_t length)
-{
-    uint32_t crc = 0xFFFFFFFFu;
-    for (uint32_t k = 0; k < length; k++) {
-        crc ^= bytes[k];
-        for (uint8_t bit = 0; bit < 8u; bit++) {
-            crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xEDB88320u : 0u);
-        }
-    }
-    return ~crc;
-}
+#define CRC_AT (PARAMETER_IMAGE_BYTES - 4u)
 
 /* binary32 bits as an integer that sorts as the numbers do; -0 equals 0. */
 static int32_t real32_order(uint32_t bits)
@@ -112,9 +99,9 @@ static const struct parameter_relation RELATIONS[] = {
 #define TRIANGLE_LOW SCALAR(0.05)
 #define TRIANGLE_HIGH SCALAR(3.09)
 
-static uint32_t image_bits(const struct parameter_image *image, uint16_t entry)
+uint32_t parameters_get(const struct parameter_image *image, uint16_t entry)
 {
-    return read_u32(&image->bytes[HEADER_BYTES + 4u * entry]);
+    return get_u32(&image->bytes[HEADER_BYTES + 4u * entry]);
 }
 
 /* The entry that fills a field; every field has one. */
@@ -129,7 +116,7 @@ static uint16_t entry_of(size_t offset)
 
 static scalar angle_of(const struct parameter_image *image, size_t offset)
 {
-    return scalar_from_real32(image_bits(image, entry_of(offset)), 0);
+    return scalar_from_real32(parameters_get(image, entry_of(offset)), 0);
 }
 
 /* False, and *entry the offender, when two parameters contradict one another. */
@@ -137,8 +124,8 @@ static bool relations_hold(const struct parameter_image *image, uint16_t *entry)
 {
     for (uint8_t n = 0; n < sizeof RELATIONS / sizeof RELATIONS[0]; n++) {
         const uint16_t lower = entry_of(RELATIONS[n].lower);
-        const int32_t low = real32_order(image_bits(image, lower));
-        const int32_t high = real32_order(image_bits(image, entry_of(RELATIONS[n].higher)));
+        const int32_t low = real32_order(parameters_get(image, lower));
+        const int32_t high = real32_order(parameters_get(image, entry_of(RELATIONS[n].higher)));
         if (low > high || (low == high && !RELATIONS[n].may_be_equal)) {
             *entry = lower;
             return false;
@@ -159,8 +146,31 @@ static bool relations_hold(const struct parameter_image *image, uint16_t *entry)
     return true;
 }
 
-enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
-                                const struct parameter_image *image, uint16_t *entry)
+/* Whether a number may stand at this place: inside its limits, and held by the number type. */
+static enum parameter_change number_fits(uint16_t entry, uint32_t bits, const struct bases *bases)
+{
+    const struct parameter_entry *const row = &TABLE[entry];
+    if (!real32_is_number(bits)) {
+        return PARAMETER_NOT_HELD;
+    }
+    if (real32_order(bits) < real32_order(row->low)) {
+        return PARAMETER_TOO_LOW;
+    }
+    if (real32_order(bits) > real32_order(row->high)) {
+        return PARAMETER_TOO_HIGH;
+    }
+    const int8_t exponent = base_of(row, bases);
+    const bool held =
+        row->kind == PARAMETER_GAIN ? gain_holds_real32(bits, exponent) : scalar_holds_real32(bits, exponent);
+    return held ? PARAMETER_CHANGED : PARAMETER_NOT_HELD;
+}
+
+static struct bases image_bases(const struct parameter_image *image)
+{
+    return (struct bases){(int8_t)image->bytes[8], (int8_t)image->bytes[9], (int8_t)image->bytes[10]};
+}
+
+enum ecu_status parameters_check(const struct parameter_image *image, uint16_t *entry)
 {
     const uint8_t *const bytes = image->bytes;
     *entry = 0;
@@ -168,34 +178,36 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
         bytes[3] != (uint8_t)'R') {
         return ECU_IMAGE_NOT_ONE;
     }
-    if (read_u32(&bytes[4]) != PARAMETER_LAYOUT_HASH) {
+    if (get_u32(&bytes[4]) != PARAMETER_LAYOUT_HASH) {
         return ECU_IMAGE_OTHER_LAYOUT;
     }
-    if (crc32(bytes, PARAMETER_IMAGE_BYTES - 4u) != read_u32(&bytes[PARAMETER_IMAGE_BYTES - 4u])) {
+    if (crc32_add(CRC32_START, bytes, CRC_AT) != get_u32(&bytes[CRC_AT])) {
         return ECU_IMAGE_DAMAGED;
     }
-    const struct bases found = {(int8_t)bytes[8], (int8_t)bytes[9], (int8_t)bytes[10]};
+    const struct bases found = image_bases(image);
     if (!bases_valid(&found)) {
         return ECU_IMAGE_BASES;
     }
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
-        const uint32_t bits = image_bits(image, k);
-        const int8_t exponent = base_of(&TABLE[k], &found);
-        const bool held = TABLE[k].kind == PARAMETER_GAIN ? gain_holds_real32(bits, exponent)
-                                                          : scalar_holds_real32(bits, exponent);
-        if (!real32_is_number(bits) || real32_order(bits) < real32_order(TABLE[k].low) ||
-            real32_order(bits) > real32_order(TABLE[k].high) || !held) {
+        if (number_fits(k, parameters_get(image, k), &found) != PARAMETER_CHANGED) {
             *entry = k;
             return ECU_PARAMETER_RANGE;
         }
     }
-    if (!relations_hold(image, entry)) {
-        return ECU_PARAMETER_RELATION;
+    return relations_hold(image, entry) ? ECU_OK : ECU_PARAMETER_RELATION;
+}
+
+enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
+                                const struct parameter_image *image, uint16_t *entry)
+{
+    const enum ecu_status status = parameters_check(image, entry);
+    if (status != ECU_OK) {
+        return status;
     }
-    *bases = found;
+    *bases = image_bases(image);
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
-        const uint32_t bits = image_bits(image, k);
-        const int8_t exponent = base_of(&TABLE[k], &found);
+        const uint32_t bits = parameters_get(image, k);
+        const int8_t exponent = base_of(&TABLE[k], bases);
         uint8_t *const field = (uint8_t *)machine + TABLE[k].offset;
         if (TABLE[k].kind == PARAMETER_GAIN) {
             *(gain *)(void *)field = gain_from_real32(bits, exponent);
@@ -204,6 +216,31 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
         }
     }
     return ECU_OK;
+}
+
+bool parameters_suit_period(const struct parameter_image *image, scalar dt_s)
+{
+    const uint32_t bits = parameters_get(image, entry_of(FIELD(observer_bandwidth)));
+    return amp(gain_from_real32(bits, 0), dt_s) < SCALAR(1);
+}
+
+enum parameter_change parameters_set(struct parameter_image *image, uint16_t entry, uint32_t bits)
+{
+    const struct bases bases = image_bases(image);
+    const enum parameter_change fits = number_fits(entry, bits, &bases);
+    if (fits != PARAMETER_CHANGED) {
+        return fits;
+    }
+    uint8_t *const place = &image->bytes[HEADER_BYTES + 4u * entry];
+    const uint32_t before = get_u32(place);
+    uint16_t other = 0;
+    put_u32(place, bits);
+    if (!relations_hold(image, &other)) {
+        put_u32(place, before);
+        return PARAMETER_CONTRADICTS;
+    }
+    put_u32(&image->bytes[CRC_AT], crc32_add(CRC32_START, image->bytes, CRC_AT));
+    return PARAMETER_CHANGED;
 }
 
 int8_t base_torque(const struct bases *bases)

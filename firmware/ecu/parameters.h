@@ -41,6 +41,26 @@ extern const struct parameter_image default_parameter_image;
 enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
                                 const struct parameter_image *image, uint16_t *entry);
 
+/* The same check without filling anything. */
+enum ecu_status parameters_check(const struct parameter_image *image, uint16_t *entry);
+
+/* False when the period is too long for the observer's bandwidth. */
+bool parameters_suit_period(const struct parameter_image *image, scalar dt_s);
+
+/* A parameter of a good image, binary32 in SI; entry < PARAMETER_COUNT. */
+uint32_t parameters_get(const struct parameter_image *image, uint16_t entry);
+
+enum parameter_change {
+    PARAMETER_CHANGED,
+    PARAMETER_TOO_LOW,
+    PARAMETER_TOO_HIGH,
+    PARAMETER_NOT_HELD,   /* no number, or too large for the number type with this machine's bases */
+    PARAMETER_CONTRADICTS /* another parameter */
+};
+
+/* Change one parameter of a good image, which stays one; it is as it was when the number is refused. */
+enum parameter_change parameters_set(struct parameter_image *image, uint16_t entry, uint32_t bits);
+
 /* Exponent of a torque's, mass's and inertia's base; of a volume's and flow's. */
 int8_t base_torque(const struct bases *bases);
 int8_t base_volume(const struct bases *bases);

@@ -1,5 +1,6 @@
-/* The whole platform, as the ECU sees it: three functions. Linux, the in-process library and a
- * microcontroller are ports of the same ECU; nothing else of the machine reaches ecu/ or control/. */
+/* The whole platform, as the ECU sees it: three functions and, where there is one, a memory for parameters. Linux,
+ * the in-process library and a microcontroller are ports of the same ECU; nothing else of the machine reaches ecu/
+ * or control/. */
 #ifndef ECU_PORT_H
 #define ECU_PORT_H
 
@@ -20,6 +21,8 @@ enum port_status {
     PORT_DOWN   /* the bus is gone; the port's owner decides what follows */
 };
 
+struct store_port; /* ecu/store.h */
+
 struct ecu_port {
     void *context; /* handed to every function below */
     /* Both never block. */
@@ -27,6 +30,8 @@ struct ecu_port {
     enum port_status (*receive)(void *context, struct can_frame_11bit *frame);
     /* Monotonic time in us; wraps at 2^32. Used for the timing figures only, never by the law. */
     uint32_t (*now_us)(void *context);
+    /* Where parameters survive power-off; NULL: they do not, and saving is refused. */
+    const struct store_port *store;
 };
 
 #endif

@@ -38,7 +38,11 @@ static enum ecu_refusal start_later(struct ecu *ecu, enum ecu_event event)
 
 enum ecu_refusal request_event(struct ecu *ecu, const struct ecu_port *port, enum ecu_event event)
 {
-    if (event == EVENT_RUN || event == EVENT_COMMISSION || event == EVENT_HOLD) {
+    const bool starts = event == EVENT_RUN || event == EVENT_COMMISSION || event == EVENT_HOLD;
+    if (parameter_set_coming(ecu) && (starts || event == EVENT_TARE)) {
+        return REFUSAL_NOT_IN_STANDBY; /* there is no machine until the set has come */
+    }
+    if (starts) {
         return start_later(ecu, event);
     }
     if (event == EVENT_TARE && ecu->is_pending) {
@@ -49,6 +53,7 @@ enum ecu_refusal request_event(struct ecu *ecu, const struct ecu_port *port, enu
         ecu->is_pending = false; /* the later request wins */
     }
     if (event == EVENT_RESET_FAULT && refusal == REFUSAL_NONE) {
+        ecu->stored = STORE_OK; /* confirmed: a restart does not ask again */
         fault_clear_all(ecu, port);
         (void)operation_event(ecu, EVENT_SENSORS_READY);
     }

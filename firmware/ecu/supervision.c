@@ -195,12 +195,12 @@ static void watch_estimate(struct ecu *ecu, const struct ecu_port *port)
     struct supervision *const s = &ecu->supervision;
     struct estimator *const estimator = &ecu->controller.estimator;
     const struct prior *const load = &ecu->machine.estimator.m[M_T];
-    const bool mismatch = estimator->strikes_h[SWING] >= s->mismatch_limit ||
-                          estimator->strikes_h[WRIST] >= s->mismatch_limit ||
+    const bool mismatch = estimator->hydraulics[SWING].strikes >= s->mismatch_limit ||
+                          estimator->hydraulics[WRIST].strikes >= s->mismatch_limit ||
                           (uint16_t)(estimator->reopened - s->reopened) >= REOPENED_MOST;
     if (mismatch) {
-        estimator->strikes_h[SWING] = 0;
-        estimator->strikes_h[WRIST] = 0;
+        estimator->hydraulics[SWING].strikes = 0;
+        estimator->hydraulics[WRIST].strikes = 0;
         s->reopened = estimator->reopened;
     }
     degrade(ecu, port, FAULT_MODEL_MISMATCH, CLEARING_MISMATCH, mismatch);

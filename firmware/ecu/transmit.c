@@ -5,8 +5,6 @@
 #include "ecu/e2e.h"
 #include "ecu/wire.h"
 
-enum tx_counter { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING };
-
 #define VALVE_DISABLED DIARC_VALVES_SWING_CONTROL_DISABLED_CHOICE
 #define VALVE_ACTIVE DIARC_VALVES_SWING_CONTROL_ACTIVE_CHOICE
 
@@ -14,12 +12,15 @@ enum tx_counter { TX_VALVES, TX_ESTIMATE, TX_TRACKING, TX_PARAMETERS, TX_TIMING 
 #define TIMING_PAGES 5
 #define PAGE_TICK_TIMES 4
 
-/* Protect a packed frame and advance its counter. */
-static void protect(struct ecu *ecu, enum tx_counter which, struct can_frame_11bit *frame)
+/* Protect a packed frame, advance its counter, and keep the data for who asks by SDO. */
+static void protect(struct ecu *ecu, enum sent_frame which, struct can_frame_11bit *frame)
 {
     uint8_t *const counter = &ecu->tx_counter[which];
     e2e_protect((uint16_t)frame->id, *counter, frame->data);
     *counter = (uint8_t)((*counter + 1u) % E2E_COUNTER_STATES);
+    for (uint8_t k = 0; k < 8u; k++) {
+        ecu->sent[which][k] = frame->data[k];
+    }
 }
 
 struct can_frame_11bit transmit_sync(uint8_t sync_counter)
@@ -96,7 +97,7 @@ struct can_frame_11bit transmit_estimate(struct ecu *ecu)
         .load_sd = (uint16_t)WIRE_ENCODE(sd, DIARC_ESTIMATE_LOAD_SD, base, 0, WIRE_MAX_U16),
         .updating = estimator->updating,
         .load_used = controller->armed && controller->kind == CONTROLLER_DIARC,
-        .load_at_bound = m_t <= load->low || m_t >= load->high,
+        .load_at_bound = !parameter_set_coming(ecu) && (m_t <= load->low || m_t >= load->high),
         .valve_saturated = out[SWING].saturated || out[WRIST].saturated,
         .moving = controller->armed && (trajectory_moving(&controller->trajectory[SWING]) ||
                                         trajectory_moving(&controller->trajectory[WRIST])),

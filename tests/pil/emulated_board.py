@@ -19,7 +19,8 @@ ANSWER_LIMIT_S = 5.0
 STOP_LIMIT_S = 5.0
 CYCLE_NS = 40  # SysTick and processor: 25 MHz
 INSTRUCTION_NS = 64  # -icount shift=6: 2^6 ns of emulated time for each
-STAGES = ("wait", "uart", "receive", "law", "send")  # enum stage in firmware/ports/cortex_m/measure.h
+# enum stage in firmware/ports/cortex_m/measure.h
+STAGES = ("wait", "uart", "receive", "frames", "estimate", "control", "send", "tick")
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class EmulatedBoard:
         return Wire(self.port)
 
     def figures(self) -> Figures:
-        """Ask an image that counts (DIARC_COUNT_INSTRUCTIONS) for what it has counted in RUN."""
+        """Ask an image that counts (DIARC_COUNT_INSTRUCTIONS) for what it has counted."""
         with self.connect() as wire:
             text = wire.ask("C\rM\r", r"MF[0-9A-F]{16}0{8}\r")
         lines = re.findall(r"M([0-9])([0-9A-F]{8})([0-9A-F]{8})([0-9A-F]{8})\r", text)

@@ -85,7 +85,7 @@ def test_byte_that_came_inside_a_stage_is_no_growth(monkeypatch: pytest.MonkeyPa
 
     def measured(factor: float) -> dict[str, budget.Measured]:
         figures = {name: changed(record, name, "insn_max", factor)[name] for name in record}
-        return {name: budget.Measured(budget.Budget(**f), {"law": (1, 2)}, []) for name, f in figures.items()}
+        return {name: budget.Measured(budget.Budget(**f), {"tick": (1, 2)}, []) for name, f in figures.items()}
 
     for factors, differs in (((1.05, 1.0, 1.0), 0), ((1.05, 1.05, 1.0), 0), ((1.05, 1.04, 1.05), len(record))):
         left = iter(factors)

@@ -106,7 +106,8 @@ def function_pointers(root: Path) -> list[str]:
 # Nothing optimised away, nothing inlined, constants where they belong; and the calls written beside the object.
 PLAIN = ("-O0", "-fno-pic", "-fno-pie", "-g0", "-fcallgraph-info", "-Wvla", "-Walloca", "-Wpointer-arith")
 # What a compiler itself calls to copy and to clear.
-COMPILER_CALLS = frozenset(("memcpy", "memset", "memmove"))
+# fmaf: float's add_product on a host built for no processor in particular; one instruction on a Cortex-M4F
+COMPILER_CALLS = frozenset(("memcpy", "memset", "memmove", "fmaf"))
 
 
 @dataclass(frozen=True)
@@ -220,11 +221,14 @@ def test_no_include_points_the_wrong_way() -> None:
 
 
 def test_no_call_leaves_but_through_the_port() -> None:
-    """GIVEN control/ and ecu/ THEN the port's functions are the only ones that are called through a pointer."""
+    """GIVEN control/ and ecu/ THEN the ports' functions are the only ones that are called through a pointer."""
     assert function_pointers(ROOT) == [
         "firmware/ecu/port.h: send",
         "firmware/ecu/port.h: receive",
         "firmware/ecu/port.h: now_us",
+        "firmware/ecu/store.h: read",
+        "firmware/ecu/store.h: erase",
+        "firmware/ecu/store.h: program",
     ]
 
 
@@ -249,7 +253,8 @@ def test_no_function_recurses(objects: list[Outcome]) -> None:
     """GIVEN who calls whom WHEN followed THEN nobody comes back: the stack has a bound."""
     for scalar in SCALARS:
         graph = call_graph(objects, scalar)
-        assert "controller_step" in graph["ecu_tick_end"]  # it is the whole graph
+        work = graph.get("firmware/ecu/ecu.c:work", set())  # unless the compiler has put it into its one caller
+        assert "controller_step" in graph["ecu_tick_end"] | work  # it is the whole graph
         assert any("sine" in callee for callee in graph["wrist_trig"])
         assert recursion(graph) == []
 

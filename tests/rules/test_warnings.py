@@ -101,13 +101,17 @@ def test_no_source_is_left_out(target: Target, configure: Configure) -> None:
         assert pairs >= {(file, scalar) for file in core for scalar in SCALARS}
 
 
+UNROLL = '_Pragma("GCC unroll 9")'  # the one pragma there is: it says nothing about warnings
+
+
 def test_no_flag_is_lost_or_switched_off(target: Target, configure: Configure) -> None:
     """GIVEN every source WHEN configured THEN all flags are there, and none that takes one back; and no source does."""
     for unit in units_for(target, configure):
         assert set(FLAGS) <= set(unit.flags), unit
-        assert [flag for flag in unit.flags if re.match(r"-w$|-Wno-|-O[^2]?$|-isystem", flag)] == [], unit
+        assert [flag for flag in unit.flags if re.match(r"-w$|-Wno-|-O[^23s]?$|-isystem", flag)] == [], unit
     for source in sources("firmware/**/*.[ch]", "can_protocol/generated/*.[ch]"):
-        assert not re.search(r"#\s*pragma|_Pragma|__extension__", (ROOT / source).read_text("utf-8")), source
+        text = (ROOT / source).read_text("utf-8").replace(UNROLL, "")
+        assert not re.search(r"#\s*pragma|_Pragma|__extension__", text), source
 
 
 WARNINGS = {

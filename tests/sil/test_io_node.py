@@ -35,9 +35,9 @@ class Rig:
         chance[:8] = 0.0
         if noise is not None:
             chance[:6] = noise
-        for _ in range(io_node.periods_due(self.node, counter)):
-            io_node.advance_one_period(self.node, self.plant, self.timing, self.errors, chance[7])
-        rows = io_node.node_sample(self.node, self.plant, self.layout, self.errors, False, counter, chance, self.out)
+        rows = io_node.node_sync(
+            self.node, self.plant, self.layout, self.timing, self.errors, False, counter, chance, self.out
+        )
         assert rows == 3
         answer = {}
         for row in self.out:

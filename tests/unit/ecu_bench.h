@@ -51,7 +51,7 @@ static struct {
     uint8_t status[3]; /* encoders, pressures */
     bool silent[3];
     bool follow; /* the arm is where its reference is, the spools pass what that takes, pressures are noisy */
-    double lag_s; /* it does so this much later */
+    double lag_s;                                               /* it does so this much later */
     bool stuck_angle[JOINTS], stuck_pressure[JOINTS][CHAMBERS]; /* while it follows */
 } sensors;
 
@@ -237,7 +237,7 @@ static inline uint16_t carrying_pressure(enum joint i, const struct reference no
     const scalar a[JOINTS] = {now[SWING].a, now[WRIST].a};
     const struct wrist_trig trig = wrist_trig(arm, now[WRIST].q);
     struct arm_row row;
-    arm_inverse_dynamics(arm, &trig, i, w, a, SCALAR(1), &row);
+    arm_inverse_dynamics(arm, &trig, i, w, a, coulomb_sign(arm, w[i]), SCALAR(1), &row);
     scalar theta[THETA_M];
     for (uint8_t k = 0; k < THETA_M; k++) {
         theta[k] = ecu.machine.estimator.m[k].value;

@@ -72,7 +72,7 @@ static scalar torque(const struct arm *arm, scalar q2, enum joint i, const scala
 {
     const struct wrist_trig t = wrist_trig(arm, q2);
     struct arm_row row;
-    arm_inverse_dynamics(arm, &t, i, w, a, SCALAR(1), &row);
+    arm_inverse_dynamics(arm, &t, i, w, a, coulomb_sign(arm, w[i]), SCALAR(1), &row);
     return arm_row_torque(&row, i, theta);
 }
 
@@ -110,8 +110,8 @@ static void test_momentum_form_is_another_model_than_the_inverse_dynamics(void)
             for (uint8_t n = 0; n < 4; n++) {
                 momentum_at(time + at[n] * STEP_S, (enum joint)i, &momentum[n]);
             }
-            arm_force(&ARM, &t, (enum joint)i, w, w[i], LEVER, &force);
-            arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, LEVER, &whole);
+            arm_force(&ARM, &t, (enum joint)i, w, coulomb_sign(&ARM, w[i]), LEVER, &force);
+            arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, coulomb_sign(&ARM, w[i]), LEVER, &whole);
             for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
                 double y[4];
                 for (uint8_t n = 0; n < 4; n++) {
@@ -296,7 +296,7 @@ static void test_friction_sign_taken_of_the_noisy_rate(void)
     const struct wrist_trig t = wrist_trig(&ARM, SCALAR(0.2));
     const scalar w[JOINTS] = {SCALAR(-0.01), SCALAR(0.02)};
     struct arm_row row;
-    arm_force(&ARM, &t, SWING, w, SCALAR(0.3), SCALAR(1), &row);
+    arm_force(&ARM, &t, SWING, w, coulomb_sign(&ARM, SCALAR(0.3)), SCALAR(1), &row);
     TEST_ASSERT_TRUE(row.phi[COL_FV] == w[SWING]);
     TEST_ASSERT_DOUBLE_WITHIN(1e-6, smooth_sign(SCALAR(0.3)), real(row.phi[COL_FC]));
 }
@@ -311,10 +311,10 @@ static void test_friction_of_the_cylinder_acts_at_the_joint(void)
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct arm_row joint[2];
         struct arm_row cylinder[2];
-        arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, SCALAR(1), &joint[0]);
-        arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, LEVER, &cylinder[0]);
-        arm_force(&ARM, &t, (enum joint)i, w, w[i], SCALAR(1), &joint[1]);
-        arm_force(&ARM, &t, (enum joint)i, w, w[i], LEVER, &cylinder[1]);
+        arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, coulomb_sign(&ARM, w[i]), SCALAR(1), &joint[0]);
+        arm_inverse_dynamics(&ARM, &t, (enum joint)i, w, a, coulomb_sign(&ARM, w[i]), LEVER, &cylinder[0]);
+        arm_force(&ARM, &t, (enum joint)i, w, coulomb_sign(&ARM, w[i]), SCALAR(1), &joint[1]);
+        arm_force(&ARM, &t, (enum joint)i, w, coulomb_sign(&ARM, w[i]), LEVER, &cylinder[1]);
         for (uint8_t n = 0; n < 2u; n++) {
             for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
                 const double factor = k == COL_FV ? 0.64 : k == COL_FC ? 0.8 : 1;

@@ -345,6 +345,7 @@ static void test_valve_kicked_by_hold_or_run(void)
             TEST_ASSERT_INT32_WITHIN(FULL_SPOOL / 100, before[SWING], spool(SWING));
             TEST_ASSERT_INT32_WITHIN(FULL_SPOOL / 100, before[WRIST], spool(WRIST));
             TEST_ASSERT_EQUAL_INT(controller, ecu.controller.kind); /* a request under way cannot change it */
+            TEST_ASSERT_EQUAL_INT(controller, ecu.requested_controller);
             if (n == 0) {
                 ticks(STOP_TICKS + 300);
             }
@@ -455,7 +456,7 @@ static void test_operation_forgets_what_was_commissioned(void)
         const struct prior *const m = ecu.machine.estimator.m;
         const scalar fv1 = m[FV1].value + per_unit(3, base_torque(&ecu.bases));
         estimator->theta_m[FV1] = fv1;
-        const scalar wide = estimator_sd_m(estimator, constants, FV1);
+        const scalar open_sd = estimator_sd_m(estimator, constants, FV1);
         ask(REQUEST_STANDBY);
         ticks(STOP_TICKS);
         TEST_ASSERT_EQUAL_INT(MODE_STANDBY, ecu.mode);
@@ -481,7 +482,7 @@ static void test_operation_forgets_what_was_commissioned(void)
         tick();
         TEST_ASSERT_TRUE(estimator->theta_m[M_T] == SCALAR(0));
         TEST_ASSERT_TRUE(estimator->theta_m[FV1] == fv1);
-        TEST_ASSERT_TRUE(estimator_sd_m(estimator, constants, FV1) == wide);
+        TEST_ASSERT_TRUE(estimator_sd_m(estimator, constants, FV1) == open_sd);
     }
 }
 

@@ -395,6 +395,30 @@ static void test_flood_of_frames_holds_up_the_tick(void)
     TEST_ASSERT_EQUAL_UINT8(0, ecu.receive.refused);
 }
 
+static void test_friction_of_the_cylinder_taken_for_the_joints(void)
+{
+    /* GIVEN a machine whose friction acts at the cylinder, and one where it acts at the joint WHEN the arm is away from 0
+     * THEN the estimator's lever of friction is the cylinder's lever arm over that at 0, or 1 */
+    for (int at_cylinder = 0; at_cylinder < 2; at_cylinder++) {
+        struct parameter_image image = default_parameter_image;
+        image_set(&image, "arm.friction_at_cylinder", at_cylinder);
+        power_on(&image, 1000);
+        sensors.angle[SWING] = angle_raw(0.8);
+        sensors.angle[WRIST] = angle_raw(-0.7);
+        to_standby();
+        ticks(2 * ROW_TURNS);
+        for (uint8_t i = 0; i < JOINTS; i++) {
+            const struct cylinder *const cylinder = &ecu.machine.cylinder[i];
+            const struct cylinder_constants *const constants = &ecu.constants.cylinder[i];
+            const double R0 = real(cylinder_at(cylinder, constants, SCALAR(0)).R);
+            const scalar q = i == SWING ? SCALAR(0.8) : SCALAR(-0.7);
+            const double expected = at_cylinder == 1 ? real(cylinder_at(cylinder, constants, q).R) / R0 : 1;
+            TEST_ASSERT_TRUE(at_cylinder == 0 || fabs(expected - 1) > 0.05);
+            TEST_ASSERT_DOUBLE_WITHIN(1e-5, expected, real(ecu.controller.estimator.mechanics[i].lever));
+        }
+    }
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -413,5 +437,6 @@ int main(void)
     RUN_TEST(test_something_survives_a_reset);
     RUN_TEST(test_full_send_queue_changes_what_the_ecu_does);
     RUN_TEST(test_flood_of_frames_holds_up_the_tick);
+    RUN_TEST(test_friction_of_the_cylinder_taken_for_the_joints);
     return UNITY_END();
 }

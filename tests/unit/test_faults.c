@@ -702,11 +702,11 @@ static void test_contradicting_sensors_not_noticed(void)
     for (uint8_t i = 0; i < JOINTS; i++) {
         setUp();
         to_run(CONTROLLER_DIARC);
-        ecu.controller.estimator.strikes_h[i] = (uint8_t)(most - 1u);
+        ecu.controller.estimator.hydraulics[i].strikes = (uint8_t)(most - 1u);
         expect_none(10);
-        ecu.controller.estimator.strikes_h[i] = most;
+        ecu.controller.estimator.hydraulics[i].strikes = most;
         expect_fault(FAULT_MODEL_MISMATCH);
-        TEST_ASSERT_EQUAL_UINT8(0, ecu.controller.estimator.strikes_h[i]);
+        TEST_ASSERT_EQUAL_UINT8(0, ecu.controller.estimator.hydraulics[i].strikes);
         expect_gone_after_a_second(FAULT_MODEL_MISMATCH);
         expect_none(100);
     }
@@ -1147,14 +1147,9 @@ static void test_heartbeat_consumed_though_told_not_to(void)
     to_run(CONTROLLER_DIARC);
     queue_heartbeat(2);
     expect_none(1);
-    for (int k = 0; k < 4 * 65535 - 1; k++) {
-        ecu_tick_begin(&ecu, &PORT);
-        queue_sensors();
-        (void)ecu_tick_receive(&ecu, &PORT);
-        ecu_tick_end(&ecu, &PORT);
-        bus.sent_count = 0;
-    }
-    TEST_ASSERT_EQUAL_HEX32(0, ecu.active_faults);
+    TEST_ASSERT_EQUAL_UINT32(250, ecu.supervision.consumer_us);
+    ecu.supervision.consumer_us = 65000000; /* 260000 ticks on */
+    expect_none(4 * 535);
     tick();
     TEST_ASSERT_EQUAL_HEX32(1u << FAULT_HEARTBEAT_LOST, ecu.active_faults);
     ecu.supervision.consumer_us = UINT32_C(1) << 31; /* and its count ends there */
@@ -1250,6 +1245,48 @@ static void test_fault_shown_is_over_already(void)
     TEST_ASSERT_EQUAL_HEX8(0, fault_error_register(&ecu));
 }
 
+static void test_time_limit_shorter_or_longer_than_can_be_counted(void)
+{
+    /* GIVEN the shortest cavitation at the longest tick WHEN a chamber's pressure is gone THEN a fault in the first tick,
+     * and none before; the longest limits at the shortest tick are the longest that can be counted */
+    struct parameter_image image = default_parameter_image;
+    image_set(&image, "supervision.persist_s", 0.001);
+    image_set(&image, "control.observer_rad_s", 20);
+    power_on(&image, 20000);
+    sensors.pressure[WRIST][BORE] = below_Pa(40e5);
+    to_run(CONTROLLER_PID);
+    expect_none(5);
+    sensors.pressure[WRIST][BORE] = 0;
+    expect_fault(FAULT_CAVITATION);
+    image = default_parameter_image;
+    image_set(&image, "supervision.bound_s", 30);
+    image_set(&image, "supervision.saturation_s", 16.3);
+    power_on(&image, 250);
+    TEST_ASSERT_EQUAL_UINT16(UINT16_MAX, ecu.supervision.bound_ticks);
+    TEST_ASSERT_EQUAL_UINT16(65200, ecu.supervision.saturation_ticks);
+}
+
+static void test_cause_that_lasts_for_ever_taken_for_gone(void)
+{
+    /* GIVEN sensors that are silent for 300 ticks, a pressure that is low for more than 65535 WHEN the counts are at
+     * their ends THEN they stay there: INIT, and the fault, last as long as their cause */
+    to_standby();
+    silence(true);
+    for (int k = 0; k < 300; k++) {
+        tick();
+        TEST_ASSERT_EQUAL_INT(k < WRONG_TICKS ? MODE_STANDBY : MODE_INIT, ecu.mode);
+    }
+    TEST_ASSERT_EQUAL_UINT8(255, ecu.supervision.sensors_wrong);
+    setUp();
+    sensors.pressure[SWING][BORE] = below_Pa(limit_of("pressure_min_Pa"));
+    to_run(CONTROLLER_PID);
+    ecu.supervision.lasting[LASTING_CAVITATION] = UINT16_MAX - 1u;
+    expect_fault(FAULT_CAVITATION);
+    ticks(3);
+    TEST_ASSERT_EQUAL_UINT16(UINT16_MAX, ecu.supervision.lasting[LASTING_CAVITATION]);
+    TEST_ASSERT_TRUE(fault_active(&ecu, FAULT_CAVITATION));
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -1293,5 +1330,7 @@ int main(void)
     RUN_TEST(test_bus_that_takes_no_valve_frame_driven_on);
     RUN_TEST(test_several_faults_told_as_one);
     RUN_TEST(test_fault_shown_is_over_already);
+    RUN_TEST(test_time_limit_shorter_or_longer_than_can_be_counted);
+    RUN_TEST(test_cause_that_lasts_for_ever_taken_for_gone);
     return UNITY_END();
 }

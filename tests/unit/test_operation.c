@@ -436,9 +436,9 @@ static void test_tare_finds_another_zero(void)
         TEST_ASSERT_DOUBLE_WITHIN(32, -0.4e5, offset_Pa((enum joint)i, ANNULUS));
     }
     /* with both sides at tank pressure in truth, the force is that of the areas' difference */
-    ticks(2);
+    ticks(ROW_TURNS);
     const double force_N =
-        si_of(ecu.controller.estimator.previous.force[SWING], ecu.bases.pressure + ecu.bases.area);
+        si_of(ecu.controller.estimator.hydraulics[SWING].force, ecu.bases.pressure + ecu.bases.area);
     TEST_ASSERT_DOUBLE_WITHIN(0.1, 3e5 * (8.04247719e-4 - 5.49778714e-4), force_N);
 }
 

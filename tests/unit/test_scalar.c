@@ -299,6 +299,55 @@ static void test_subnormal_parameter_gets_a_hidden_bit(void)
     expect_real32(1.17549421e-38f, -96);
 }
 
+/* The nearest binary32 number is what the host's own conversion gives. */
+static void expect_real32_of(scalar x, int8_t exponent)
+{
+    const float expected = (float)ldexp(real(x), exponent);
+    uint32_t bits;
+    memcpy(&bits, &expected, sizeof bits);
+    TEST_ASSERT_EQUAL_HEX32(bits, real32_from_scalar(x, exponent));
+}
+
+static void test_estimate_told_as_another_number(void)
+{
+    /* GIVEN numbers of all sizes, ties between two binary32 numbers, the largest, the smallest, zero WHEN turned into
+     * binary32 THEN the nearest, halves to even; and a parameter comes back as it was */
+    struct lcg lcg = {7};
+    static const double values[] = {0,         1,       0.1,       1.0 + 0x1p-24, 1.0 + 0x3p-24,
+                                    31.999999, 0x1p-24, 0x1.8p-20, 5.0 - 0x1p-22};
+    for (int exponent = -96; exponent <= 96; exponent++) {
+        for (unsigned k = 0; k < COUNT_OF(values); k++) {
+            expect_real32_of(from_real(values[k]), (int8_t)exponent);
+            if (values[k] > 0) {
+                expect_real32_of(from_real(-values[k]), (int8_t)exponent);
+            }
+        }
+        const scalar x = from_real(lcg_uniform(&lcg, -32, 32));
+        expect_real32_of(x, (int8_t)exponent);
+    }
+    expect_real32_of(MOST, 0);
+    expect_real32_of(LEAST, 0);
+#if defined(DIARC_SCALAR_FIXED)
+    expect_real32_of(INT32_MIN, 0);
+    expect_real32_of(0x01FFFFFF, 0); /* rounds up to the next power of two */
+#else
+    expect_real32_of(SCALAR(FLT_MAX), 1); /* infinite */
+    expect_real32_of(SCALAR(FLT_MAX), 96);
+    expect_real32_of(SCALAR(FLT_MIN), -3);
+    expect_real32_of(SCALAR(FLT_MIN) * SCALAR(1.7), -20);
+    TEST_ASSERT_EQUAL_HEX32(0x7FC00000u, real32_from_scalar((scalar)NAN, 0));
+#endif
+    for (int k = 0; k < 1000; k++) {
+        const float value = (float)lcg_uniform(&lcg, -30, 30);
+        const int8_t exponent = (int8_t)(k % 20);
+        uint32_t bits;
+        memcpy(&bits, &value, sizeof bits);
+        const scalar x = scalar_from_real32(bits, 0);
+        TEST_ASSERT_TRUE(scalar_from_real32(real32_from_scalar(x, 0), 0) == x); /* no more than 24 bits */
+        expect_real32_of(x, exponent);
+    }
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -318,5 +367,6 @@ int main(void)
     RUN_TEST(test_raw_does_not_come_back);
     RUN_TEST(test_parameter_bits_read_inexactly);
     RUN_TEST(test_subnormal_parameter_gets_a_hidden_bit);
+    RUN_TEST(test_estimate_told_as_another_number);
     return UNITY_END();
 }

@@ -63,7 +63,7 @@ static void run_tick(void)
 {
     const uint32_t limit_us =
         DIARC_PACE == PACE_STRICT ? PERIOD_US * STRICT_LIMIT_PERCENT / 100u : STALL_LIMIT_US;
-    (void)measure_switch(STAGE_LAW);
+    (void)measure_switch(STAGE_FRAMES);
     const uint32_t begin_us = clock_port_now_us(NULL);
     ecu_tick_begin(&the_ecu, &the_port);
 
@@ -81,10 +81,10 @@ static void run_tick(void)
             sleep(lines, period);
         }
     }
-    (void)measure_switch(STAGE_LAW);
+    (void)measure_switch(STAGE_FRAMES);
     ecu_tick_end(&the_ecu, &the_port);
     (void)measure_switch(STAGE_WAIT);
-    measure_end_tick(the_ecu.mode == MODE_RUN);
+    measure_end_tick();
 }
 
 /* From the opening of the channel until it closes: an ECU from power-on to power-off. */

@@ -2,6 +2,9 @@
 
 #if defined(DIARC_COUNT_INSTRUCTIONS)
 
+#include <stddef.h>
+
+#include "ecu/ecu.h"
 #include "ports/cortex_m/clock.h"
 #include "ports/cortex_m/registers.h"
 #include "ports/cortex_m/slcan_text.h"
@@ -9,7 +12,6 @@
 
 #define STACK_PATTERN 0xA5A5A5A5u
 #define LAST_LINE 0xFu
-#define LINE_BYTES 27u
 
 extern uint32_t image_stack_begin[], image_stack_end[];
 
@@ -23,6 +25,7 @@ static struct figures figures[STAGES];
 static uint32_t ticks;
 static enum stage current = STAGE_WAIT;
 static uint32_t since;
+static uint32_t overhead; /* what measuring itself takes from one switch to the next */
 
 void measure_start(void)
 {
@@ -30,7 +33,12 @@ void measure_start(void)
     for (uint32_t *word = image_stack_begin; word < used; word++) {
         *word = STACK_PATTERN;
     }
-    since = clock_cycles();
+    (void)measure_switch(STAGE_WAIT);
+    (void)measure_switch(STAGE_WAIT);
+    figures[STAGE_WAIT].tick = 0;
+    (void)measure_switch(STAGE_WAIT);
+    overhead = figures[STAGE_WAIT].tick;
+    figures[STAGE_WAIT].tick = 0;
 }
 
 enum stage measure_switch(enum stage stage)
@@ -38,36 +46,69 @@ enum stage measure_switch(enum stage stage)
     interrupts_disable();
     const uint32_t now = clock_cycles();
     const enum stage before = current;
-    figures[before].tick += now - since;
+    figures[before].tick += now - since - overhead;
     current = stage;
     since = now;
     interrupts_enable();
     return before;
 }
 
-void measure_end_tick(bool counts)
+void measure_end_tick(void)
 {
+    figures[STAGE_TICK].tick = figures[STAGE_FRAMES].tick + figures[STAGE_ESTIMATE].tick +
+                               figures[STAGE_CONTROL].tick + figures[STAGE_SEND].tick;
     for (uint8_t k = 0; k < STAGES; k++) {
         struct figures *const f = &figures[k];
-        if (counts) {
-            f->least = ticks == 0u || f->tick < f->least ? f->tick : f->least;
-            f->most = f->tick > f->most ? f->tick : f->most;
-            f->sum += f->tick;
-        }
+        f->least = ticks == 0u || f->tick < f->least ? f->tick : f->least;
+        f->most = f->tick > f->most ? f->tick : f->most;
+        f->sum += f->tick;
         f->tick = 0;
     }
-    ticks += counts ? 1u : 0u;
+    ticks++;
+}
+
+/* The linker makes calls of NAME calls of __wrap_NAME, and __real_NAME is NAME. */
+void __real_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                           const struct estimator_constants *constants, const struct arm *arm,
+                           const struct estimator_sample *sample);
+void __real_controller_step(struct controller *controller, const struct machine *machine,
+                            const struct controller_constants *constants, const struct measurement *measured);
+void __wrap_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                           const struct estimator_constants *constants, const struct arm *arm,
+                           const struct estimator_sample *sample);
+void __wrap_controller_step(struct controller *controller, const struct machine *machine,
+                            const struct controller_constants *constants, const struct measurement *measured);
+
+void __wrap_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                           const struct estimator_constants *constants, const struct arm *arm,
+                           const struct estimator_sample *sample)
+{
+    const enum stage before = measure_switch(STAGE_ESTIMATE);
+    __real_estimator_step(estimator, parameters, constants, arm, sample);
+    (void)measure_switch(before);
+}
+
+void __wrap_controller_step(struct controller *controller, const struct machine *machine,
+                            const struct controller_constants *constants, const struct measurement *measured)
+{
+    const enum stage before = measure_switch(STAGE_CONTROL);
+    __real_controller_step(controller, machine, constants, measured);
+    (void)measure_switch(before);
 }
 
 static void answer(uint32_t stage, uint32_t a, uint32_t b, uint32_t c)
 {
-    uint8_t line[LINE_BYTES] = {(uint8_t)'M'};
+    uint8_t *const line = uart_free_line();
+    if (line == NULL) {
+        return;
+    }
+    line[0] = (uint8_t)'M';
     slcan_write_hex(&line[1], stage, 1);
     slcan_write_hex(&line[2], a, 8);
     slcan_write_hex(&line[10], b, 8);
     slcan_write_hex(&line[18], c, 8);
     line[26] = (uint8_t)'\r';
-    (void)uart_send(line, LINE_BYTES);
+    uart_send(UART_LINE_BYTES);
 }
 
 bool measure_command(uint8_t verb)

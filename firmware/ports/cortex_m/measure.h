@@ -1,6 +1,8 @@
 /* With DIARC_COUNT_INSTRUCTIONS: how many processor cycles each stage of a tick takes, and the stack's
  * depth. Where an instruction takes a fixed time, as in QEMU with -icount, the cycles count instructions.
- * Else nothing of this is in the image. The SLCAN command M answers for all ticks in RUN, in hexadecimal:
+ * Else nothing of this is in the image. Estimate and control are parts of ecu_tick_end: their functions are wrapped by the
+ * linker (--wrap), so that the code that is measured is the code that runs. The SLCAN command M answers for all ticks
+ * since the start, of every mode, in hexadecimal:
  *
  *     M STAGE least mean most     a line for each stage: one digit and three times eight, without spaces
  *     MF ticks stack 0            the ticks counted, the bytes of stack used */
@@ -12,11 +14,14 @@
 
 /* Every cycle counts for one stage. */
 enum stage {
-    STAGE_WAIT,    /* between ticks and for frames */
-    STAGE_UART,    /* interrupts: a byte from and to the UART; a CAN peripheral needs none of it */
-    STAGE_RECEIVE, /* SLCAN text to frames, their checks, requests */
-    STAGE_LAW,     /* SYNC, the samples, estimator and law, packing of frames */
-    STAGE_SEND,    /* frames to SLCAN text */
+    STAGE_WAIT,     /* between ticks and for frames */
+    STAGE_UART,     /* interrupts: a byte from and to the UART; a CAN peripheral needs none of it */
+    STAGE_RECEIVE,  /* SLCAN text to frames, their checks, requests */
+    STAGE_FRAMES,   /* SYNC, samples out of frames, supervision, packing of frames */
+    STAGE_ESTIMATE, /* estimator_step */
+    STAGE_CONTROL,  /* the rest of controller_step: reference, observer, cylinders, law */
+    STAGE_SEND,     /* frames to SLCAN text */
+    STAGE_TICK,     /* no stage: frames, estimate, control and send of a tick together */
     STAGES
 };
 
@@ -24,8 +29,8 @@ enum stage {
 void measure_start(void);
 /* What follows counts for `stage`; the stage before. */
 enum stage measure_switch(enum stage stage);
-/* A tick is over; it is taken into the figures when `counts`. */
-void measure_end_tick(bool counts);
+/* A tick is over. */
+void measure_end_tick(void);
 /* Answers M; false when the command is another. */
 bool measure_command(uint8_t verb);
 #else
@@ -36,9 +41,8 @@ static inline enum stage measure_switch(enum stage stage)
 {
     return stage;
 }
-static inline void measure_end_tick(bool counts)
+static inline void measure_end_tick(void)
 {
-    (void)counts;
 }
 static inline bool measure_command(uint8_t verb)
 {

@@ -71,4 +71,10 @@ static inline void barrier(void)
 #define UART_RX_VECTOR 0u /* interrupt numbers */
 #define UART_TX_VECTOR 1u
 
+/* What memory holds is not kept in registers across this. One processor and no cache: no instruction is needed. */
+static inline void memory_barrier(void)
+{
+    __asm volatile("" ::: "memory");
+}
+
 #endif

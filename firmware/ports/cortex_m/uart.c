@@ -1,13 +1,21 @@
 #include "ports/cortex_m/uart.h"
 
+#include <stddef.h>
+
 #include "ports/cortex_m/measure.h"
 #include "ports/cortex_m/registers.h"
 
-#define RING_BYTES 512u /* a power of two; a tick's frames take at most some 200 */
+#define RING_LINES 16u /* a power of two; a tick's frames are some 8 */
 
-/* One side only writes `put`, the other only `taken`; both count on and wrap at 2^32. */
+struct line {
+    uint8_t text[UART_LINE_BYTES];
+    uint8_t length;
+};
+
+/* One side only writes `put`, the other only `taken`; both count on and wrap at 2^32. What a line holds is written
+ * before `put` counts it and read before `taken` does. */
 struct ring {
-    volatile uint8_t byte[RING_BYTES];
+    struct line line[RING_LINES];
     volatile uint32_t put;
     volatile uint32_t taken;
 };
@@ -15,6 +23,8 @@ struct ring {
 static struct ring rx; /* put by the interrupt, taken by the main loop */
 static struct ring tx; /* put by the main loop, taken by the interrupt */
 static volatile uint32_t rx_lines;
+static uint8_t rx_length; /* of the line that is coming in */
+static uint8_t tx_sent;   /* of the line that is going out */
 
 static uint32_t used(const struct ring *ring)
 {
@@ -22,17 +32,14 @@ static uint32_t used(const struct ring *ring)
     return put - ring->taken;
 }
 
-static void put(struct ring *ring, uint8_t byte)
+static struct line *oldest(struct ring *ring)
 {
-    ring->byte[ring->put % RING_BYTES] = byte;
-    ring->put = ring->put + 1u;
+    return &ring->line[ring->taken % RING_LINES];
 }
 
-static uint8_t take(struct ring *ring)
+static struct line *next(struct ring *ring)
 {
-    const uint8_t byte = ring->byte[ring->taken % RING_BYTES];
-    ring->taken = ring->taken + 1u;
-    return byte;
+    return &ring->line[ring->put % RING_LINES];
 }
 
 void uart_start(void)
@@ -42,17 +49,31 @@ void uart_start(void)
     NVIC_ENABLE = 1u << UART_RX_VECTOR | 1u << UART_TX_VECTOR;
 }
 
+/* A line that is complete; it is lost when the ring is full. */
+static void end_line(void)
+{
+    if (used(&rx) < RING_LINES) {
+        next(&rx)->length = rx_length;
+        memory_barrier();
+        rx.put = rx.put + 1u;
+    }
+    rx_length = 0;
+    rx_lines = rx_lines + 1u;
+}
+
 void uart_rx_interrupt(void)
 {
     const enum stage before = measure_switch(STAGE_UART);
     UART_INTERRUPT = UART_INTERRUPT_RX;
     while ((UART_STATE & UART_STATE_RX_FULL) != 0u) {
         const uint8_t byte = (uint8_t)UART_DATA;
-        if (used(&rx) < RING_BYTES) {
-            put(&rx, byte); /* else it is lost, and with it the line that it is part of */
-        }
         if (byte == (uint8_t)'\r') {
-            rx_lines = rx_lines + 1u;
+            end_line();
+        } else if (rx_length < UART_LINE_BYTES) {
+            if (used(&rx) < RING_LINES) {
+                next(&rx)->text[rx_length] = byte;
+            }
+            rx_length++;
         }
     }
     (void)measure_switch(before);
@@ -63,30 +84,46 @@ void uart_tx_interrupt(void)
     const enum stage before = measure_switch(STAGE_UART);
     UART_INTERRUPT = UART_INTERRUPT_TX;
     while (used(&tx) > 0u && (UART_STATE & UART_STATE_TX_FULL) == 0u) {
-        UART_DATA = take(&tx);
+        const struct line *const line = oldest(&tx);
+        UART_DATA = line->text[tx_sent];
+        tx_sent++;
+        if (tx_sent == line->length) {
+            tx_sent = 0;
+            memory_barrier();
+            tx.taken = tx.taken + 1u;
+        }
     }
     (void)measure_switch(before);
 }
 
-bool uart_send(const uint8_t *text, uint8_t length)
+uint8_t *uart_free_line(void)
 {
-    if (RING_BYTES - used(&tx) < length) {
-        return false;
-    }
-    for (uint8_t k = 0; k < length; k++) {
-        put(&tx, text[k]);
-    }
-    NVIC_PENDING = 1u << UART_TX_VECTOR; /* the ring is emptied in one place only */
-    return true;
+    return used(&tx) < RING_LINES ? next(&tx)->text : NULL;
 }
 
-bool uart_receive(uint8_t *byte)
+void uart_send(uint8_t length)
+{
+    next(&tx)->length = length;
+    memory_barrier();
+    tx.put = tx.put + 1u;
+    NVIC_PENDING = 1u << UART_TX_VECTOR; /* the ring is emptied in one place only */
+}
+
+const uint8_t *uart_received_line(uint8_t *length)
 {
     if (used(&rx) == 0u) {
-        return false;
+        return NULL;
     }
-    *byte = take(&rx);
-    return true;
+    const struct line *const line = oldest(&rx);
+    memory_barrier();
+    *length = line->length;
+    return line->text;
+}
+
+void uart_release(void)
+{
+    memory_barrier();
+    rx.taken = rx.taken + 1u;
 }
 
 uint32_t uart_lines(void)

@@ -98,6 +98,11 @@ int32_t diarc_inproc_end(void *ecu, const uint8_t *rx, int32_t rx_count, uint8_t
     return buffers.tx_count;
 }
 
+void diarc_inproc_request_safe_stop(void *ecu)
+{
+    ecu_request_safe_stop(ecu);
+}
+
 int32_t diarc_inproc_shutdown(void *ecu, uint8_t *tx, int32_t tx_frames)
 {
     struct frame_buffers buffers = {.tx = (struct can_frame_11bit *)(void *)tx, .tx_frames = tx_frames};

@@ -24,6 +24,9 @@ int32_t diarc_inproc_begin(void *ecu, uint8_t *tx, int32_t tx_frames);
 /* The rest of the tick on rx_count frames. Returns the number of frames written to tx. */
 int32_t diarc_inproc_end(void *ecu, const uint8_t *rx, int32_t rx_count, uint8_t *tx, int32_t tx_frames);
 
+/* What the port of another platform does on its own, between ticks, when it is told to end. */
+void diarc_inproc_request_safe_stop(void *ecu);
+
 /* Valves shut. Returns the number of frames written to tx. */
 int32_t diarc_inproc_shutdown(void *ecu, uint8_t *tx, int32_t tx_frames);
 

@@ -11,6 +11,7 @@
 #include "ports/linux/realtime.h"
 #include "ports/linux/socketcan.h"
 #include "ports/linux/socketcand_client.h"
+#include "ports/linux/store_file.h"
 
 #ifndef DIARC_VERSION
 #error "the build defines DIARC_VERSION, a string"
@@ -25,6 +26,8 @@ enum { EXIT_RUN_FAILED = 1, EXIT_WRONG_USE = 2 };
 static struct ecu the_ecu;
 static struct parameter_image the_image;
 static struct socketcan socketcan_bus;
+static struct parameter_image stored_image;
+static struct store_file the_store;
 static struct socketcand_client socketcand_bus;
 
 /* Reads exactly one image; false after one line on stderr. */
@@ -54,6 +57,58 @@ static bool read_image(const char *path, struct parameter_image *image)
                       path, longer ? "more than " : "", count, sizeof image->bytes);
     }
     return false;
+}
+
+/* NULL: no fault, nothing to say. */
+static const char *store_fault_text(enum store_status status)
+{
+    switch (status) {
+    case STORE_OLDER:
+        return "one of its two sets is damaged and may have been the newer one, the other is in use";
+    case STORE_DAMAGED:
+        return "what was saved is damaged, the default is in use";
+    case STORE_FOREIGN:
+        return "what was saved does not suit this firmware, the default is in use";
+    case STORE_FAILED:
+        return "cannot be read, the default is in use";
+    case STORE_OK:
+    case STORE_EMPTY:
+        break;
+    }
+    return NULL;
+}
+
+/* The ECU with its parameters; false after one line on stderr. */
+static bool start_ecu(const struct options *options)
+{
+    if (options->params_path != NULL && !read_image(options->params_path, &the_image)) {
+        return false;
+    }
+    const struct parameter_image *const image = options->params_path != NULL ? &the_image : NULL;
+    if (options->store_path != NULL && !store_file_open(&the_store, options->store_path)) {
+        (void)fprintf(stderr, "diarc_ecu: %s\n", the_store.message);
+        return false;
+    }
+    const struct store_port *const store = options->store_path != NULL ? &the_store.port : NULL;
+    uint16_t entry = 0;
+    const enum ecu_status status =
+        ecu_init_stored(&the_ecu, store, &stored_image, image, options->period_us, &entry);
+    if (status != ECU_OK) {
+        const bool names_parameter = status == ECU_PARAMETER_RANGE || status == ECU_PARAMETER_RELATION;
+        (void)fprintf(stderr, "diarc_ecu: %s%s%s%s%s\n", image != NULL ? options->params_path : "",
+                      image != NULL ? ": " : "", ecu_status_text(status), names_parameter ? ": " : "",
+                      names_parameter ? parameter_name(entry) : "");
+        return false;
+    }
+    const char *const fault = store_fault_text(the_ecu.stored);
+    if (fault != NULL) {
+        (void)fprintf(
+            stderr,
+            "diarc_ecu: --store %s: %s; the ECU is in FAULT until RESET_FAULT confirms that, and saving "
+            "makes the store good again\n",
+            options->store_path, fault);
+    }
+    return true;
 }
 
 static struct bus *open_bus(const struct options *options)
@@ -117,23 +172,14 @@ static void print_stats(const struct loop_stats *loop, const struct bus_stats *b
 
 static int run(const struct options *options, const char *program)
 {
-    if (options->params_path != NULL && !read_image(options->params_path, &the_image)) {
-        return EXIT_WRONG_USE;
-    }
-    const struct parameter_image *const image = options->params_path != NULL ? &the_image : NULL;
-    uint16_t entry = 0;
-    const enum ecu_status status = ecu_init(&the_ecu, image, options->period_us, &entry);
-    const bool names_parameter = status == ECU_PARAMETER_RANGE || status == ECU_PARAMETER_RELATION;
-    if (status != ECU_OK) {
-        (void)fprintf(stderr, "diarc_ecu: %s%s%s%s%s\n", image != NULL ? options->params_path : "",
-                      image != NULL ? ": " : "", ecu_status_text(status), names_parameter ? ": " : "",
-                      names_parameter ? parameter_name(entry) : "");
+    if (!start_ecu(options)) {
         return EXIT_WRONG_USE;
     }
     struct bus *const bus = open_bus(options);
     if (bus == NULL) {
         return EXIT_WRONG_USE;
     }
+    bus->port.store = options->store_path != NULL ? &the_store.port : NULL;
     request_realtime(options->pace, program);
     if (!options->quiet) {
         (void)printf("diarc_ecu " DIARC_VERSION " on %s, %s pace, %lu us\n", options->bus,
@@ -159,6 +205,9 @@ static int run(const struct options *options, const char *program)
             "timeout of their node\n",
             stderr);
         exit_status = was_up ? EXIT_RUN_FAILED : 0; /* without a bus there was nothing left to do */
+    }
+    if (options->store_path != NULL) {
+        store_file_close(&the_store);
     }
     if (!options->quiet) {
         print_stats(&stats, &bus->stats);

@@ -136,6 +136,15 @@ static enum options_result parse_params(const char *text, struct options *option
     return OPTIONS_RUN;
 }
 
+static enum options_result parse_store(const char *text, struct options *options)
+{
+    if (text[0] == '\0') {
+        return complain("--store: expected a file name");
+    }
+    options->store_path = text;
+    return OPTIONS_RUN;
+}
+
 static const struct {
     const char *name;
     const char *value;
@@ -144,6 +153,7 @@ static const struct {
     {"--pace", "realtime, strict or lockstep", parse_pace},
     {"--period-us", "a whole number, 250..20000", parse_period},
     {"--params", "a file name", parse_params},
+    {"--store", "a file name", parse_store},
 };
 
 /* "--flag VALUE" or "--flag=VALUE" at argv[*index]; moves *index to the last argument used. */
@@ -197,7 +207,9 @@ enum options_result options_parse(int argc, char *const argv[], struct options *
 void options_print_help(void)
 {
     (void)fputs(
-        "usage: diarc_ecu BUS [--pace realtime|strict|lockstep] [--period-us N] [--params FILE] [--quiet]\n"
+        "usage: diarc_ecu BUS [--pace realtime|strict|lockstep] [--period-us N] [--params FILE] [--store "
+        "FILE]\n"
+        "                 [--quiet]\n"
         "\n"
         "The DIARC ECU: leads the CAN bus with SYNC, controls the hydraulic arm, stops with valves at zero.\n"
         "\n"
@@ -208,6 +220,8 @@ void options_print_help(void)
         "  --pace lockstep  as fast as both sides can, same numbers as realtime\n"
         "  --period-us N    control period, 250..20000 us, default 1000\n"
         "  --params FILE    parameter image, default the built-in reference arm\n"
+        "  --store FILE     where saved parameters survive; made if it is not there. A saved set wins over "
+        "--params\n"
         "  --quiet          errors only\n"
         "  --help, --version\n"
         "\n"
@@ -218,6 +232,6 @@ void options_print_help(void)
         "\n"
         "SIGINT, SIGTERM and SIGHUP: safe stop, valves shut, end; a second one ends at once, valves shut.\n"
         "exit: 0 stopped by such a signal; 1 the bus is gone, or did not take the last valve frame; 2 wrong\n"
-        "use, or the bus cannot be opened\n",
+        "use, or the bus or the store cannot be opened\n",
         stdout);
 }

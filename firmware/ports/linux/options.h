@@ -20,6 +20,7 @@ struct options {
     enum pace pace;                /* default PACE_REALTIME */
     uint32_t period_us;            /* 250..20000, default 1000 */
     const char *params_path;       /* NULL: the built-in parameters */
+    const char *store_path;        /* NULL: what is changed on the bus ends with the process */
     bool quiet;
 };
 

@@ -1,0 +1,117 @@
+"""Faults that need a process and a bus: an ECU that is killed, a bus that is cut, monitors that come and go."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sil_plant.buses import BusError, connect_python_can
+
+LIMIT_S = 60.0
+PAUSED = "this machine paused the plant"
+
+MOVE = """
+duration_s = 1.5
+[[load]]
+time_s = 0.0
+load_kg = 3.0
+[[swing.segment]]
+target_rad = 0.3
+duration_s = 0.8
+dwell_s = 0.3
+[[swing.segment]]
+target_rad = 0.0
+duration_s = 0.4
+"""
+
+
+@pytest.fixture
+def both(run_py, tmp_path: Path) -> Callable[[str], tuple[dict, dict]]:
+    """``both(fault)``: figures of a scenario in process, and on tcp with an ECU of its own in lockstep."""
+
+    def run(fault: str) -> tuple[dict, dict]:
+        path = tmp_path / "s.toml"
+        path.write_text(f"{MOVE}[[faults]]\n{fault}", "utf-8")
+        figures = []
+        for bus in (("inproc",), ("tcp:127.0.0.1:0", "--ecu", "spawn", "--pace", "lockstep")):
+            json_path = tmp_path / "r.json"
+            done = run_py("--bus", *bus, "--scenario", path, "--json", json_path, timeout_s=LIMIT_S)
+            assert done.returncode == 0, done.stderr
+            figures.append(json.loads(json_path.read_text("utf-8")))
+        return figures[0], figures[1]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        'kind = "ecu_killed"\nduration_s = 0.1\n',
+        'kind = "bus_off"\nduration_s = 0.03\n',
+        'kind = "dropped"\ntarget = "valves"\nduration_s = 0.05\n',
+        'kind = "corrupted"\ntarget = "encoders"\nsize = 3\nduration_s = 0.004\n',
+    ],
+)
+def test_bus_does_not_give_another_trace_of_a_fault(both, fault: str) -> None:
+    """GIVEN an ECU killed and restarted, a bus cut, frames disturbed WHEN run in process and over tcp
+    THEN the same trace, and it ends in RUN both times.
+    """
+    inproc, tcp = both(f"{fault}start_s = 0.3\nrecover_after_s = 0.2\n")
+    assert tcp["ticks"] == inproc["ticks"] == 1601
+    assert tcp["trace_sha256"] == inproc["trace_sha256"]
+
+
+def test_monitor_that_comes_and_goes_does_not_disturb(start_run_py, simulate, tmp_path: Path) -> None:
+    """GIVEN monitors that join the bus, read a little or nothing, and leave, all the time WHEN the arm moves
+    THEN the trace is that of a run without them.
+    """
+    json_path = tmp_path / "r.json"
+    run = start_run_py(
+        "--bus", "tcp:127.0.0.1:0", "--ecu", "spawn", "--pace", "lockstep", "--duration", 2, "--json", json_path
+    )  # fmt: skip
+    end = time.monotonic() + LIMIT_S
+    # the hub's port is on the command line of the ECU that was started
+    while not (found := re.search(r"tcp:127\.0\.0\.1:[1-9]\d*", ecu_command_line(run.process.pid))):
+        assert time.monotonic() < end and run.process.poll() is None, run.err.read_text()
+        time.sleep(0.01)
+    attached = 0
+
+    def come_and_go(reads: int) -> None:
+        nonlocal attached
+        while run.process.poll() is None and time.monotonic() < end:
+            try:
+                with connect_python_can(found.group()) as monitor:
+                    attached += 1
+                    for _ in range(reads):
+                        monitor.recv(0.01)
+            except (BusError, OSError):
+                return  # the run is over
+
+    monitors = [threading.Thread(target=come_and_go, args=(reads,)) for reads in (0, 50)]
+    for monitor in monitors:
+        monitor.start()
+    assert run.wait(LIMIT_S) == 0, run.err.read_text()
+    for monitor in monitors:
+        monitor.join(LIMIT_S)
+    assert attached >= 2
+    if PAUSED not in run.err.read_text():
+        figures = json.loads(json_path.read_text("utf-8"))
+        assert figures["trace_sha256"] == simulate(3.0, duration=2.0).result.trace_sha256
+
+
+def ecu_command_line(parent: int) -> str:
+    """Command lines of a process's children, as text."""
+    lines = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(path.read_text().rpartition(")")[2].split()[1]) == parent:
+                lines.append(path.with_name("cmdline").read_bytes().replace(b"\0", b" ").decode())
+        except (OSError, ValueError):
+            continue  # it has ended meanwhile
+    return "\n".join(lines)
