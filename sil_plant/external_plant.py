@@ -103,6 +103,10 @@ class ExternalPlant:
         self._folder = tempfile.mkdtemp(prefix="diarc-fmu-")
         node = session.node
         node.count[io_node.EXTERNAL] = 1
+        # compiled now, not while a bus waits
+        io_node.command_delay(session.timing, session.errors, 0.0)
+        io_node.take_command(io_node.make_node(node.y, 0.0), session.timing, session.errors)
+        load_due(session, -1)
         try:
             fmpy.extract(str(self.path), unzipdir=self._folder)
             self._fmu = instantiate_fmu(self._folder, self.model, "CoSimulation", logger=self._log, debug_logging=True)

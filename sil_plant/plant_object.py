@@ -6,6 +6,9 @@ more, for any processor of this architecture, and without what ties it to Python
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import llvmlite.binding as llvm
 import numpy as np
 from numba import carray, njit, types
@@ -15,8 +18,6 @@ from sil_plant.plant import STATES, PlantParameters, integrate, rest
 
 STEP, REST = "diarc_plant_step", "diarc_plant_rest"
 SCRATCH_SHAPE = make_node(np.zeros(STATES), 0.0).scratch.shape
-# What only code for arrays that numba owns would call; there are none, and the C side says so to the linker.
-_NUMBA_OWN = ("NRT_MemInfo_call_dtor",)
 _DOUBLES = types.CPointer(types.float64)
 
 
@@ -34,12 +35,20 @@ def slots(parameters: PlantParameters) -> dict[str, list[int]]:
     return places
 
 
-def _unflatten(parameters: PlantParameters) -> object:
+Shape = tuple[tuple[str, int], ...]  # names of the fields, and their sizes; 0: a number
+
+
+def _shape(parameters: PlantParameters) -> Shape:
+    sizes = (value.size if isinstance(value, np.ndarray) else 0 for value in parameters)
+    return tuple(zip(parameters._fields, sizes, strict=True))
+
+
+def _unflatten(shape: Shape) -> Any:
     """Compiled function that makes the parameters from their vector; numba builds such a tuple from a call only."""
-    arguments = []
-    for name, places in slots(parameters).items():
-        is_array = isinstance(getattr(parameters, name), np.ndarray)
-        arguments.append(f"v[{places[0]}:{places[-1] + 1}]" if is_array else f"v[{places[0]}]")
+    arguments, at = [], 0
+    for _, size in shape:
+        arguments.append(f"v[{at}:{at + size}]" if size else f"v[{at}]")
+        at += max(size, 1)
     scope = {"PlantParameters": PlantParameters}
     exec(f"def unflatten(v):\n    return PlantParameters({', '.join(arguments)})\n", scope)
     return njit(scope["unflatten"])
@@ -60,8 +69,13 @@ def plant_object(parameters: PlantParameters) -> bytes:
     parameters : PlantParameters
         Any arm: only the shapes matter.
     """
-    unflatten = _unflatten(parameters)
-    count, scratch_shape = flatten(parameters).size, SCRATCH_SHAPE
+    return _object(_shape(parameters))
+
+
+@functools.cache
+def _object(shape: Shape) -> bytes:
+    unflatten = _unflatten(shape)
+    count, scratch_shape = sum(max(size, 1) for _, size in shape), SCRATCH_SHAPE
 
     def step(y, u, load_kg, values, duration_s, scratch):
         integrate(
