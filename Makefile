@@ -9,7 +9,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet 
 C_FILES = find firmware tests/unit tests/fuzz tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images budget demo paper test faults coverage fuzz fuzz-corpus lint format generate clean
+.PHONY: help setup firmware images fmu budget demo paper test faults coverage fuzz fuzz-corpus lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"

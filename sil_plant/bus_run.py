@@ -11,6 +11,7 @@ import numpy as np
 
 from sil_plant import injection, protocol
 from sil_plant.buses import FramePort
+from sil_plant.external_plant import ExternalPlant
 from sil_plant.frames import FRAME_BYTES, from_row, to_row
 from sil_plant.io_node import advance_one_period
 from sil_plant.session import (
@@ -103,6 +104,7 @@ def run_on_bus(
     progress: Callable[[int], None],
     alive: Callable[[], None],
     power: EcuPower | None = None,
+    plant: ExternalPlant | None = None,
 ) -> None:
     """Run the session to its end; the ECU must just have booted.
 
@@ -118,12 +120,16 @@ def run_on_bus(
         Raises when an ECU that was spawned has ended.
     power : EcuPower or None
         Switches the ECU off and on again, for a scenario that has it killed.
+    plant : ExternalPlant, optional
+        Another plant than ours.
 
     Raises
     ------
     EcuLostError
         When SYNC stays away, or the ECU boots again and no fault of the scenario made it; the plant has closed its
         valves by then.
+    PlantLostError
+        When the other plant fails.
     ConfigError
         When the ECU follows another DBC.
     """
@@ -133,7 +139,7 @@ def run_on_bus(
     while True:
         frame = port.receive(ECU_LOST_S)
         if frame is None:
-            close_valves(session)
+            close_valves(session, plant)
             alive()
             raise EcuLostError(f"the ECU fell silent for {ECU_LOST_S:g} s; the valves are closed")
         can_id, data = frame
@@ -143,14 +149,14 @@ def run_on_bus(
             tick = int(session.progress.index[TICK])
             if tick == check_tick:
                 check_hash(session)
-            rows = on_sync(session, data[0], out)
+            rows = on_sync(session, data[0], out) if plant is None else plant.on_sync(session, data[0], out)
             if rows < 0:
                 return
             port.send_many([from_row(row) for row in out[:rows]])
             if tick % 100 == 0:
                 progress(tick)
         elif can_id == heartbeat_id and data == b"\0" and not reboot_expected(session):
-            close_valves(session)
+            close_valves(session, plant)
             raise EcuLostError("the ECU restarted in the middle of the run; the valves are closed")
         elif can_id < 0x800:
             on_frame(session, to_row(can_id, data))
@@ -208,10 +214,13 @@ def warm_up(session: Session) -> None:
     close_valves(session)
 
 
-def close_valves(session: Session) -> None:
+def close_valves(session: Session, plant: ExternalPlant | None = None) -> None:
     """What the node does without SYNC: it goes on by its own clock until its valves are closed."""
     for _ in range(session.timing.timeout_ticks + 2):
-        advance_one_period(session.node, session.plant, session.timing, session.errors, 0.0)
+        if plant is not None:
+            plant.advance_one_period(session, 0.0)
+        else:
+            advance_one_period(session.node, session.plant, session.timing, session.errors, 0.0)
 
 
 def leave_ecu_safe(port: FramePort) -> None:

@@ -14,6 +14,7 @@ from sil_plant import bus_run, inproc, session
 from sil_plant.buses import BusAddress, BusError, HubPort, open_frame_port
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.environment import say
+from sil_plant.external_plant import ExternalPlant
 from sil_plant.faults import Fault
 from sil_plant.machine import Machine
 from sil_plant.scenario import Scenario, with_load
@@ -91,11 +92,17 @@ def compile_plant(machine: Machine, scenario: Scenario) -> None:
     bus_run.warm_up(warm)
 
 
-def in_process(run: session.Session, image: bytes, scalar: str, progress: Callable[[int], None]) -> float:
+def in_process(
+    run: session.Session,
+    image: bytes,
+    scalar: str,
+    progress: Callable[[int], None],
+    plant: ExternalPlant | None = None,
+) -> float:
     """Run the session with the firmware in this process; the wall time it took, s."""
     ecu = inproc.InprocEcu(image, PERIOD_US, scalar)
     start = time.perf_counter()
-    while inproc.run_inproc(run, ecu, INPROC_CHUNK) == INPROC_CHUNK:
+    while inproc.run_inproc(run, ecu, INPROC_CHUNK, plant) == INPROC_CHUNK:
         progress(int(run.progress.index[session.TICK]))
         bus_run.check_hash(run)
     return time.perf_counter() - start
@@ -108,6 +115,7 @@ def over_bus(
     image: bytes,
     progress: Callable[[int], None],
     quiet: bool,
+    plant: ExternalPlant | None = None,
 ) -> float:
     """Run the session with an ECU on a bus.
 
@@ -125,6 +133,8 @@ def over_bus(
         Told the tick now and then.
     quiet : bool
         Say nothing but errors.
+    plant : ExternalPlant, optional
+        Another plant than ours.
 
     Returns
     -------
@@ -151,9 +161,9 @@ def over_bus(
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
         try:
-            bus_run.run_on_bus(run, port, progress, alive, ecu)
+            bus_run.run_on_bus(run, port, progress, alive, ecu, plant)
         except BusError as error:
-            bus_run.close_valves(run)
+            bus_run.close_valves(run, plant)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
         return time.perf_counter() - start
 

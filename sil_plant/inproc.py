@@ -11,7 +11,8 @@ from numba import njit, types
 from numba.types import WrapperAddressProtocol
 
 from sil_plant.config import ROOT, ConfigError
-from sil_plant.frames import FRAME_BYTES, frame_id
+from sil_plant.external_plant import ExternalPlant
+from sil_plant.frames import DATA, FRAME_BYTES, frame_id
 from sil_plant.protocol import SYNC_ID
 from sil_plant.session import (
     OUT_ROWS,
@@ -197,8 +198,13 @@ def closed_loop_with_faults(
     return ticks
 
 
-def run_inproc(session: Session, ecu: InprocEcu, ticks: int) -> int:
-    """Run at most ``ticks`` ticks; the number done. An ECU that a fault kills starts anew here."""
+def run_inproc(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant | None = None) -> int:
+    """Run at most ``ticks`` ticks, with another plant than ours if one is given; the number done.
+
+    An ECU that a fault kills starts anew here.
+    """
+    if plant is not None:
+        return _run_external(session, ecu, ticks, plant)
     rx = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
     tx = np.zeros((TX_ROWS, FRAME_BYTES), dtype=np.uint8)
     first = int(session.progress.index[TICK])
@@ -211,3 +217,20 @@ def run_inproc(session: Session, ecu: InprocEcu, ticks: int) -> int:
         if first + stop in restarts(session):
             ecu.restart()
     return done
+
+
+def _run_external(session: Session, ecu: InprocEcu, ticks: int, plant: ExternalPlant) -> int:
+    """As :func:`closed_loop`, but for a plant that is not compiled with us."""
+    out = np.zeros((OUT_ROWS, FRAME_BYTES), dtype=np.uint8)
+    for done in range(ticks):
+        rows = 0
+        for row in ecu.tick_begin():
+            if frame_id(row) == SYNC_ID:
+                rows = plant.on_sync(session, int(row[DATA]), out)
+            else:
+                on_frame_plain(session, row)
+        if rows < 0:
+            return done
+        for row in ecu.tick_end(out[:rows]):
+            on_frame_plain(session, row)
+    return ticks

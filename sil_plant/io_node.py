@@ -24,8 +24,8 @@ _ANGLE_LIMIT = 8388607
 _PRESSURE_LIMIT = 65534  # 65535 means invalid
 _SPOOL_LIMIT = 32767
 
-# Places in Node.count
-TICK, SYNC_LAST, SYNC_LOST, COMMAND_AGE, COMMAND_NEW, E2E_REFUSED, VALVE_COUNTER, TIMED_OUT = range(8)
+# Places in Node.count; EXTERNAL: the plant is another one than ours, and its owner moves it on
+TICK, SYNC_LAST, SYNC_LOST, COMMAND_AGE, COMMAND_NEW, E2E_REFUSED, VALVE_COUNTER, TIMED_OUT, EXTERNAL = range(9)
 
 
 class NodeLayout(NamedTuple):
@@ -142,7 +142,7 @@ def node_timing(machine: Machine, period_s: float) -> NodeTiming:
 
 def make_node(y: np.ndarray, load_kg: float) -> Node:
     """A node at rest that has heard nothing yet."""
-    count = np.zeros(8, dtype=np.int64)
+    count = np.zeros(9, dtype=np.int64)
     count[VALVE_COUNTER] = -1
     return Node(
         y=y.copy(),
@@ -162,20 +162,14 @@ def follow(node: Node, hysteresis: float) -> None:
 
 
 @njit(cache=True)
-def advance_one_period(
-    node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
-) -> None:
-    """Integrate over one period: the old set-points up to the delay, then the new ones.
+def command_delay(timing: NodeTiming, errors: NodeErrors, jitter: float) -> float:
+    """From SYNC until a command takes effect, s; ``jitter`` -1..1 says how far it is off in this period."""
+    return min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
 
-    Parameters
-    ----------
-    node, plant, timing, errors
-        The node.
-    jitter : float
-        -1..1, how far the delay is off in this period, in units of the jitter.
-    """
-    delay_s = min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
-    integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
+
+@njit(cache=True)
+def take_command(node: Node, timing: NodeTiming, errors: NodeErrors) -> None:
+    """Put the command that waits into effect; without one for too long, close the valves."""
     count = node.count
     if count[COMMAND_NEW]:
         count[COMMAND_NEW] = 0
@@ -189,6 +183,26 @@ def advance_one_period(
             node.u[0, 0] = 0.0
             node.u[0, 1] = 0.0
     follow(node, errors.hysteresis)
+
+
+@njit(cache=True)
+def advance_one_period(
+    node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
+) -> None:
+    """Integrate over one period: the old set-points up to the delay, then the new ones.
+
+    Parameters
+    ----------
+    node, plant, timing, errors
+        The node.
+    jitter : float
+        -1..1, how far the delay is off in this period, in units of the jitter.
+    """
+    if node.count[EXTERNAL]:
+        return  # sil_plant/external_plant.py has done it
+    delay_s = command_delay(timing, errors, jitter)
+    integrate(node.y, node.u[2], node.load[0], plant, delay_s, node.scratch)
+    take_command(node, timing, errors)
     integrate(node.y, node.u[2], node.load[0], plant, timing.period_s - delay_s, node.scratch)
 
 

@@ -277,33 +277,60 @@ def integrate(
                 y[n] = 0.0
 
 
-def holding_pressures(parameters: PlantParameters, q: np.ndarray, load_kg: float) -> np.ndarray:
-    """Pressures that hold the arm at rest, shape (2, 2): joint, then bore and annulus.
+@njit(cache=True)
+def rest(q: np.ndarray, load_kg: float, p: PlantParameters, y: np.ndarray) -> int:
+    """Write the state at rest: spools centred, the load held by pressure, bore and annulus adding to supply and tank.
 
-    Their sum is supply plus tank, as with a spool centred at rest.
+    Parameters
+    ----------
+    q : np.ndarray
+        Angles, rad, shape (2,).
+    load_kg : float
+        Load.
+    p : PlantParameters
+        The arm.
+    y : np.ndarray
+        Written: the state, shape (12,).
+
+    Returns
+    -------
+    int
+        -1, or the joint whose cylinder cannot hold the load between tank and supply pressure.
+    """
+    y[:] = 0.0
+    total = p.p_supply + p.p_tank
+    for i in range(2):
+        triangle = q[i] + p.q0[i]
+        lever = (
+            p.crank_ab[i] * math.sin(triangle) / math.sqrt(p.crank_a2_b2[i] - 2.0 * p.crank_ab[i] * math.cos(triangle))
+        )
+        torque = 0.0 if i == 0 else p.g * p.L2 * math.cos(q[1]) * (0.5 * p.m2 + load_kg)
+        bore = (torque / lever + total * p.area2[i]) / (p.area1[i] + p.area2[i])
+        y[Q + i] = q[i]
+        y[P_SWING + 2 * i] = bore
+        y[P_SWING + 2 * i + 1] = total - bore
+    for i in range(2):
+        for k in range(2):
+            if not p.p_tank < y[P_SWING + 2 * i + k] < p.p_supply:
+                return i
+    return -1
+
+
+def state_at_rest(parameters: PlantParameters, q: np.ndarray, load_kg: float) -> np.ndarray:
+    """State at rest at angles ``q`` (rad, shape (2,)), spools centred, the load held by pressure.
 
     Raises
     ------
     ValueError
         When a cylinder cannot hold the load between tank and supply pressure; names the joint.
     """
-    p = parameters
-    triangle = q + p.q0
-    lever = p.crank_ab * np.sin(triangle) / np.sqrt(p.crank_a2_b2 - 2.0 * p.crank_ab * np.cos(triangle))
-    torque = np.array([0.0, p.g * p.L2 * math.cos(q[1]) * (0.5 * p.m2 + load_kg)])
-    force = torque / lever
-    total = p.p_supply + p.p_tank
-    bore = (force + total * p.area2) / (p.area1 + p.area2)
-    pressures = np.column_stack([bore, total - bore])
-    for joint, name in enumerate(JOINT_NAMES):
-        if not np.all((pressures[joint] > p.p_tank) & (pressures[joint] < p.p_supply)):
-            raise ValueError(f"the {name} cylinder cannot hold {load_kg:g} kg at {q[joint]:g} rad")
-    return pressures
-
-
-def state_at_rest(parameters: PlantParameters, q: np.ndarray, load_kg: float) -> np.ndarray:
-    """State at rest at angles ``q`` (rad, shape (2,)), spools centred, the load held by pressure."""
     y = np.zeros(STATES)
-    y[:2] = q
-    y[P_SWING:XV] = holding_pressures(parameters, q, load_kg).ravel()
+    joint = rest(np.asarray(q, dtype=np.float64), float(load_kg), parameters, y)
+    if joint >= 0:
+        raise ValueError(f"the {JOINT_NAMES[joint]} cylinder cannot hold {load_kg:g} kg at {q[joint]:g} rad")
     return y
+
+
+def holding_pressures(parameters: PlantParameters, q: np.ndarray, load_kg: float) -> np.ndarray:
+    """Pressures of :func:`state_at_rest`, shape (2, 2): joint, then bore and annulus."""
+    return state_at_rest(parameters, q, load_kg)[P_SWING:XV].reshape(2, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -37,9 +38,9 @@ CSV_COLUMNS = (
 class Result:
     """Figures of one run; the JSON's keys. Lists are swing, then wrist; None where a run was too short."""
 
-    load_true_kg: float
+    load_true_kg: float | None  # and all that follows from it: None where the plant does not say it
     load_est_kg: float
-    load_err_kg: float
+    load_err_kg: float | None
     load_settle_s: float | None
     peak_err_rad: list[float]
     peak_err_after_1s_rad: list[float | None]
@@ -93,6 +94,8 @@ def settling_time(record: Record, ticks: int, timeline: Timeline) -> float | Non
     """From the start of motion until the load error stays within 0.1 kg; None if it never does."""
     start = timeline.motion
     error = np.abs(record.load_est[start:ticks] - record.load_true[start:ticks])
+    if np.isnan(error).any():
+        return None
     outside = np.nonzero(error > LOAD_BAND_KG)[0]
     if error.size == 0 or (outside.size and outside[-1] == error.size - 1):
         return None
@@ -122,11 +125,12 @@ def summarise(record: Record, run: Run) -> Result:
         for j in range(2)
     ]
     load_true = float(record.load_true[ticks - 1]) if ticks else 0.0
+    is_load_known = not np.isnan(load_true)
     simulated_s = ticks * timeline.period_s
     return Result(
-        load_true_kg=load_true,
+        load_true_kg=load_true if is_load_known else None,
         load_est_kg=run.load_est_kg,
-        load_err_kg=run.load_est_kg - load_true,
+        load_err_kg=run.load_est_kg - load_true if is_load_known else None,
         load_settle_s=settling_time(record, ticks, timeline),
         peak_err_rad=[float(v) for v in whole.max(axis=0)] if whole.size else [0.0, 0.0],
         peak_err_after_1s_rad=peak_after,
@@ -151,13 +155,18 @@ def table(result: Result, bus_load: float) -> str:
     def both(values: list[float] | list[float | None]) -> str:
         return "  ".join("      -" if v is None else f"{v * 1e3:7.4f}" for v in values)
 
+    load = f"estimated {result.load_est_kg:.3f} kg   true: not told by the plant"
+    if result.load_true_kg is not None and result.load_err_kg is not None:
+        load = (
+            f"true {result.load_true_kg:.3f} kg   estimated {result.load_est_kg:.3f} kg   "
+            f"error {result.load_err_kg:+.4f} kg"
+        )
     settle = "never" if result.load_settle_s is None else f"{result.load_settle_s:.3f} s"
     return "\n".join(
         [
             f"{result.scenario} on {result.arm}, {result.controller}, seed {result.seed}, bus {result.bus}",
-            f"  load              true {result.load_true_kg:.3f} kg   estimated {result.load_est_kg:.3f} kg   "
-            f"error {result.load_err_kg:+.4f} kg",
-            f"  within 0.1 kg     {settle} after motion starts",
+            f"  load              {load}",
+            f"  within 0.1 kg     {settle if result.load_true_kg is not None else '-'} after motion starts",
             "  errors, mrad        swing    wrist",
             f"    peak            {both(result.peak_err_rad)}",
             f"    peak after 1 s  {both(result.peak_err_after_1s_rad)}",
@@ -260,7 +269,8 @@ def write_csv(path: Path, record: Record, run: Run) -> None:
             writer = csv.writer(file)
             writer.writerow(CSV_COLUMNS)
             for row, mode in zip(columns.tolist(), record.mode[:n].tolist(), strict=True):
-                writer.writerow([*(f"{value:.9g}" for value in row), MODE_NAMES.get(mode, str(mode))])
+                numbers = ("" if math.isnan(value) else f"{value:.9g}" for value in row)
+                writer.writerow([*numbers, MODE_NAMES.get(mode, str(mode))])
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
 

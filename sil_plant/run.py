@@ -5,6 +5,7 @@ Examples
   ./firmware/diarc_ecu vcan0 &  python sil_plant/run.py --load 2.5
   python sil_plant/run.py --load 2.5 --bus tcp:127.0.0.1:29536 --ecu spawn
   python sil_plant/run.py --load 2.5 --bus inproc --json result.json --csv trace.csv
+  python sil_plant/run.py --bus inproc --fmu machine.fmu --map machine.toml
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -33,6 +35,7 @@ from sil_plant import bus_run, execution, inproc, protocol, results, session  # 
 from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
 from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
+from sil_plant.external_plant import ExternalPlant, PlantLostError  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
 from sil_plant.scenario import (  # noqa: E402
     DEFAULT_SCENARIO,
@@ -66,6 +69,8 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
         "--profile", choices=PROFILE_NAMES, default="paper", help="how kind the plant is; default paper"
     )
     parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, metavar="FILE")
+    parser.add_argument("--fmu", type=Path, metavar="FILE", help="another plant: a co-simulation FMU; goes with --map")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="which of the FMU's variables is what: docs/fmu.md")
     parser.add_argument("--scalar", choices=inproc.SCALARS, default="double", help="number type of the law, in process")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the trace, one row per tick")
@@ -73,6 +78,8 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     arguments = parser.parse_args(argv)
     if arguments.pace and arguments.ecu != "spawn":
         parser.error("--pace is the spawned ECU's: it goes with --ecu spawn")
+    if (arguments.fmu is None) != (arguments.map is None):
+        parser.error("--fmu and --map go together: docs/fmu.md describes the map")
     return arguments
 
 
@@ -84,6 +91,7 @@ class Inputs(NamedTuple):
     scenario: Scenario
     tare: bool
     address: BusAddress
+    plant: ExternalPlant | None
 
 
 def load_inputs(arguments: argparse.Namespace) -> Inputs:
@@ -120,7 +128,15 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     for path in (arguments.json, arguments.csv):
         if path is not None:
             results.check_writable(path)
-    return Inputs(machine, plant_machine, scenario, profile.tare, address)
+    plant = None
+    if arguments.fmu is not None:
+        if scenario.faults:
+            raise ConfigError("--fmu: the faults of a scenario are for our own plant; choose a scenario without any")
+        plant = ExternalPlant(arguments.fmu, arguments.map)
+        for note in plant.notes(scenario, profile.name == "paper"):
+            if not arguments.quiet:
+                say(f"run.py: note: {note}")
+    return Inputs(machine, plant_machine, scenario, profile.tare, address, plant)
 
 
 def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run, faults: list[str]) -> bool:
@@ -146,6 +162,12 @@ def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
     signal.signal(signal.SIGTERM, _interrupt)
+    with ExitStack() as cleanup:
+        return carry_out(arguments, cleanup)
+
+
+def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
+    """Run what the command line asks for; what must be undone at the end goes to ``cleanup``."""
     try:
         inputs = load_inputs(arguments)
         machine, scenario = inputs.machine, inputs.scenario
@@ -158,8 +180,12 @@ def main(argv: list[str]) -> int:
         except ValueError as error:
             raise ConfigError(f"{error} with the supply of {machine.name}") from error
         image = parameter_image(machine)
+        if inputs.plant is not None:
+            cleanup.callback(inputs.plant.close)
+            inputs.plant.start(run, scenario)
     except (ConfigError, BusError) as error:
-        say(f"run.py: {error}")
+        for line in str(error).splitlines():
+            say(f"run.py: {line}")
         return EXIT_WRONG_USE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
@@ -177,16 +203,16 @@ def main(argv: list[str]) -> int:
         progress: Callable[[int], None] = (lambda tick: bar.update(task, completed=tick)) if show else (lambda _: None)
         try:
             if inputs.address.kind == "inproc":
-                wall_s = execution.in_process(run, image, arguments.scalar, progress)
+                wall_s = execution.in_process(run, image, arguments.scalar, progress, inputs.plant)
             else:
                 pace = (arguments.pace or "realtime") if arguments.ecu == "spawn" else None
-                wall_s = execution.over_bus(run, inputs.address, pace, image, progress, arguments.quiet)
+                wall_s = execution.over_bus(run, inputs.address, pace, image, progress, arguments.quiet, inputs.plant)
         except (ConfigError, BusError, bus_run.EcuMissingError) as error:
             status, problem = EXIT_WRONG_USE, str(error)
-        except bus_run.EcuLostError as error:
+        except (bus_run.EcuLostError, PlantLostError) as error:
             status, problem = EXIT_FAILED, str(error)
         except KeyboardInterrupt:
-            bus_run.close_valves(run)
+            bus_run.close_valves(run, inputs.plant)
             status, problem = (
                 EXIT_INTERRUPTED,
                 "interrupted; the valves are closed, what was recorded is kept",
@@ -199,7 +225,7 @@ def main(argv: list[str]) -> int:
         figures = results.run_of(
             run,
             arguments.controller,
-            machine.name,
+            machine.name if inputs.plant is None else f"{machine.name}, plant {inputs.plant.path.name}",
             scenario.name,
             scenario.seed,
             arguments.bus,
