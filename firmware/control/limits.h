@@ -14,7 +14,9 @@ struct limits {
     scalar stuck_travel;   /* rad */
     scalar stuck_s;
     scalar mismatch_updates;
-    scalar angle_margin; /* rad */
+    scalar contradiction; /* rad/s */
+    scalar spool_error;   /* of full travel */
+    scalar angle_margin;  /* rad */
     scalar pressure_max; /* Pa */
     scalar pressure_min; /* Pa */
     scalar persist_s;

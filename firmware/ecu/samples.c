@@ -22,6 +22,15 @@ static enum ecu_fault missing(const struct ecu *ecu, enum received_frame row)
     return ecu->receive.row[row].spoiled ? FAULT_SENSOR_FRAMES_CORRUPT : FAULT_SENSOR_FRAMES_LOST;
 }
 
+/* The sample a missing or wrong angle is replaced by: the reference and the observer's prediction. */
+static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
+{
+    const struct controller *const c = &ecu->controller;
+    const scalar e1 = c->observer[i].e + mul(ecu->constants.dt_s, c->observer[i].w);
+    const scalar q = trajectory_now(&c->trajectory[i]).q + e1;
+    return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
+}
+
 static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t raw, int32_t before)
 {
     const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
@@ -30,10 +39,15 @@ static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t r
     if (q < cylinder->q_min - beyond || q > cylinder->q_max + beyond) {
         return FAULT_SENSOR_RANGE;
     }
-    /* the sample before may be the prediction: an increment over one tick all the same */
+    if (!ecu->controller.armed) {
+        return FAULT_NONE;
+    }
+    /* The sample before may be a prediction. The arm is not far from this tick's: an encoder that was missing or refused
+     * has to come closer to that than one that is believed may move. */
+    const bool doubted = ecu->supervision.sensors_wrong > 0u;
     const scalar most = mul(ecu->machine.limits.rate[i], ecu->constants.dt_s);
-    const bool too_fast = ecu->controller.armed && absolute(angle_of(raw - before)) > most;
-    return too_fast ? FAULT_SENSOR_RATE : FAULT_NONE;
+    const scalar off = absolute(angle_of(raw - (doubted ? predicted_angle(ecu, i) : before)));
+    return off > (doubted ? mul(SCALAR(0.25), most) : most) ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
 static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t before)
@@ -95,15 +109,6 @@ static enum ecu_fault take_pressures(const struct ecu *ecu, enum joint i, struct
         samples->spool[i] = raw.spool_position;
     }
     return wrong;
-}
-
-/* The sample a missing or wrong angle is replaced by: the reference and the observer's prediction. */
-static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
-{
-    const struct controller *const c = &ecu->controller;
-    const scalar e1 = c->observer[i].e + mul(ecu->constants.dt_s, c->observer[i].w);
-    const scalar q = trajectory_now(&c->trajectory[i]).q + e1;
-    return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
 }
 
 /* The later in this order says more: lost, corrupt, invalid, out of range, too fast. */
