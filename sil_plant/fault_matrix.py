@@ -21,6 +21,7 @@ from sil_plant.experiment import Outcome, setup_for, simulate
 from sil_plant.faults import KINDS, SENSORS, Fault, size_range
 from sil_plant.injection import FIRST, LAST, SPIKE_CHANCE, draw
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine
+from sil_plant.plant import P_SWING, P_WRIST, XV, Q
 from sil_plant.results import emergencies
 from sil_plant.scenario import PROFILE_NAMES, LoadStep, Scenario, Segment, load_profile
 
@@ -29,7 +30,7 @@ FAULTS = ROOT / "can_protocol" / "faults.toml"
 REACTIONS = ("none", "safe", "shut", "degrade", "node")
 CASE_KEYS = {
     "kind", "targets", "sizes", "duration_s", "moments", "faults", "reaction", "after_ticks", "when_moved",
-    "when_error", "may_detect", "error_factor",
+    "when_changed", "when_error", "may_detect", "error_factor",
 }  # fmt: skip
 
 # The run: there, a rest, and back, which is the proof that the ECU has recovered.
@@ -50,6 +51,7 @@ NODE_SLACK_TICKS = 2  # over the node's own timeout
 RECOVERED_ERROR_RAD = 5e-3  # at the end of the run
 SAFE_MODES = (session.MODE_INIT, session.MODE_STANDBY, 6, session.MODE_FAULT)  # 6: SAFE_STOP
 CENTRED = 1e-9
+STATE_OF_SENSOR = (Q, Q + 1, P_SWING, P_SWING + 1, P_WRIST, P_WRIST + 1, XV, XV + 1)  # of faults.SENSORS
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Case:
     reaction: str
     after_ticks: int
     when_moved: float
+    when_changed: float
     when_error: float
     may_detect: tuple[str, ...]
     error_factor: float
@@ -163,6 +166,7 @@ def _case(toml: TomlFile, item: dict[str, Any], n: int) -> Case:
         reaction=reaction,
         after_ticks=int(item.get("after_ticks", 0)),
         when_moved=float(item.get("when_moved", 0.0)),
+        when_changed=float(item.get("when_changed", 0.0)),
         when_error=float(item.get("when_error", 0.0)),
         may_detect=tuple(item.get("may_detect", ())),
         error_factor=float(item.get("error_factor", 0.0)),
@@ -249,6 +253,10 @@ def possible_tick(cell: Cell, outcome: Outcome) -> int | None:
         if cell.target in SENSORS and not cell.target.endswith("angle"):
             joints = [0 if cell.target.startswith("swing") else 1]
         ticks = np.flatnonzero(moved[:, joints].max(axis=1) > case.when_moved)
+        return tick + int(ticks[0]) if ticks.size else None
+    if case.when_changed > 0.0:
+        value = run_.record.state[first:last, STATE_OF_SENSOR[SENSORS.index(cell.target)]]
+        ticks = np.flatnonzero(np.abs(value - value[0]) > case.when_changed)
         return tick + int(ticks[0]) if ticks.size else None
     if case.when_error > 0.0:
         ticks = np.flatnonzero(tracking_error(outcome)[first:last].max(axis=1) > case.when_error)

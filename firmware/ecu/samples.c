@@ -4,6 +4,8 @@
 #include "ecu/ecu.h"
 #include "ecu/wire.h"
 
+#define US_PER_STEP \
+    1000u /* the limit of a pressure's change is for a millisecond, or the tick if that is shorter */
 #define SENSOR_STATUS_INVALID DIARC_ENCODERS_SENSOR_STATUS_INVALID_CHOICE
 
 static scalar angle_of(int32_t raw)
@@ -59,8 +61,9 @@ static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t
     /* what was kept over missing frames may have changed meanwhile; a value that was refused may not */
     const enum ecu_fault cause = ecu->supervision.wrong_cause;
     const bool kept = cause == FAULT_SENSOR_FRAMES_LOST || cause == FAULT_SENSOR_FRAMES_CORRUPT;
-    const int32_t ticks = kept ? 1 + (int32_t)ecu->supervision.sensors_wrong : 1;
-    const scalar step = absolute(pressure_of(ecu, (raw - before) / ticks));
+    const uint32_t ticks = kept ? 1u + ecu->supervision.sensors_wrong : 1u;
+    const int32_t steps = (int32_t)((ticks * ecu->period_us + US_PER_STEP - 1u) / US_PER_STEP);
+    const scalar step = absolute(pressure_of(ecu, (raw - before) / steps));
     return ecu->controller.armed && step > limits->pressure_step ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 

@@ -6,10 +6,11 @@
 #include "ecu/operation.h"
 #include "ecu/wire.h"
 
-#define OUTSIDE_TICKS 3u /* a limit is exceeded when it is for so many ticks in a row */
-#define SPOOL_TICKS 10u
+#define OUTSIDE_TICKS 3u                 /* a limit is exceeded when it is for so many ticks in a row */
+#define SPOOL_S SCALAR(0.01)             /* a spool may lag that long behind its set-point */
+#define STUCK_TICKS_LEAST 20u            /* noise may give the same raw value a few times */
 #define CONTRADICTION_SHARE SCALAR(0.25) /* of a window's, in the low pass */
-#define REOPENED_MOST 3u /* changed loads within the window that are no loads any more */
+#define REOPENED_MOST 3u                 /* changed loads within the window that are no loads any more */
 #define DUPLICATE_TICKS 100u
 #define HEARTBEAT_BASE 0x700u
 #define ID_MASK 0x7Fu
@@ -24,6 +25,11 @@ static void count_u8(uint8_t *counter)
 static void count_u16(uint16_t *counter)
 {
     *counter = *counter < UINT16_MAX ? (uint16_t)(*counter + 1u) : UINT16_MAX;
+}
+
+static uint16_t at_least(uint16_t ticks, uint16_t least)
+{
+    return ticks < least ? least : ticks;
 }
 
 static uint16_t at_least_one_u16(uint32_t ticks)
@@ -54,7 +60,8 @@ void supervision_start(struct ecu *ecu)
     const uint32_t period_us = ecu->period_us;
     ecu->supervision = (struct supervision){
         .stop_ticks = ticks_of(limits->stop_s, period_us),
-        .stuck_ticks = ticks_of(limits->stuck_s, period_us),
+        .stuck_ticks = at_least(ticks_of(limits->stuck_s, period_us), STUCK_TICKS_LEAST),
+        .spool_ticks = ticks_of(SPOOL_S, period_us),
         .persist_ticks = ticks_of(limits->persist_s, period_us),
         .saturation_ticks = ticks_of(limits->saturation_s, period_us),
         .bound_ticks = ticks_of(limits->bound_s, period_us),
@@ -108,7 +115,7 @@ static void watch_spools(struct ecu *ecu, const struct ecu_port *port)
         const scalar spool = WIRE_DECODE(ecu->samples.spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
         const bool far = absolute(ecu->controller.output[i].u - spool) > ecu->machine.limits.spool_error;
         if (lasts(&ecu->supervision, i == SWING ? LASTING_SPOOL_SWING : LASTING_SPOOL_WRIST, far,
-                  SPOOL_TICKS)) {
+                  ecu->supervision.spool_ticks)) {
             fault_raise(ecu, port, FAULT_VALVE_NOT_FOLLOWING);
         }
     }

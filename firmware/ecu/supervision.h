@@ -27,7 +27,7 @@ enum clearing { CLEARING_MISMATCH, CLEARING_CAVITATION, CLEARING_BOUND, CLEARING
 
 struct supervision {
     /* limits in ticks and counts, made once from the parameters */
-    uint16_t stop_ticks, stuck_ticks, persist_ticks, saturation_ticks, bound_ticks, second_ticks;
+    uint16_t stop_ticks, stuck_ticks, spool_ticks, persist_ticks, saturation_ticks, bound_ticks, second_ticks;
     uint8_t wrong_limit, mismatch_limit, late_limit, send_limit;
 
     uint8_t sensors_wrong;      /* ticks in a row that sensors were missing or wrong; stops at 255 */
