@@ -316,8 +316,7 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
 
 
 def recovery_frames(controller: str) -> np.ndarray:
-    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT; then the hash it takes for that if
-    it was told another. Shape (4, 16)."""
+    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT, and the right DBC hash; (4, 16)."""
     return np.array(
         [
             nmt_frame(NMT_START, node=0),
