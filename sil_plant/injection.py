@@ -71,7 +71,7 @@ VALVES_SYNC = FIRST_SENSOR + len(SENSORS)
 MOTION_REQUEST = VALVES_SYNC + 1
 ID, START, LENGTH, SIGNED, LOW, HIGH, INVALID_RAW = range(7)
 # First rows of each part of Injection.row
-RECOVERY_ROWS = 3
+RECOVERY_ROWS = 4
 _HELD = RECOVERY_ROWS
 _FRESH = _HELD + HELD_MOST
 _TO_NODE = _FRESH + FRESH_MOST
@@ -103,7 +103,7 @@ class Injection(NamedTuple):
     number, count : np.ndarray
         State, named by the constants above; ``number`` ends with the SI value of a raw step of each sensor.
     row : np.ndarray
-        Frame rows: the master's three that recover, those held, those of this tick, those for the node.
+        Frame rows: the master's four that recover, those held, those of this tick, those for the node.
     held : np.ndarray
         Of each row held: the tick it is due in, and where it goes.
     seed, wrong_hash : int
@@ -164,7 +164,8 @@ def make_injection(
     seed : int
         Of the run.
     recovery : np.ndarray
-        The master's frames that bring the ECU back: for INIT, for STANDBY, for FAULT; shape (3, 16).
+        The master's frames that bring the ECU back: for INIT, for STANDBY, for FAULT, and the right DBC hash; shape
+        (4, 16).
     """
     plan = np.zeros((len(faults), 5), dtype=np.int64)
     recover = []
@@ -483,6 +484,31 @@ def foreign_frames(injection: Injection, tick: int, priority: int, out: np.ndarr
 
 
 @njit(cache=True)
+def write_hash(row: np.ndarray, value: int) -> None:
+    """Make a row the master's SDO write of its DBC hash: an expedited download of four bytes."""
+    write_header(row, _SDO_TO_ECU, 8)
+    row[DATA] = 0x23
+    put(row, 8, 16, _MASTER_HASH_INDEX)
+    put(row, 32, 32, value)
+
+
+def hash_frame(value: int) -> np.ndarray:
+    """The same as a row of its own."""
+    row = np.zeros(FRAME_BYTES, dtype=np.uint8)
+    write_hash(row, value)
+    return row
+
+
+@njit(cache=True)
+def wrong_hash_written(injection: Injection) -> bool:
+    """True when a fault of this run tells the ECU another DBC's hash: to recover, it must be told the right one."""
+    for n in range(injection.plan.shape[0]):
+        if injection.plan[n, KIND] == DBC_MISMATCH:
+            return True
+    return False
+
+
+@njit(cache=True)
 def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np.ndarray, rows: int) -> int:
     """Append what others send in this tick that should not: network management, a second ECU; the rows then."""
     for n in range(injection.plan.shape[0]):
@@ -494,11 +520,8 @@ def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np
             out[rows, DATA] = 2 if kind == NMT_STOP else 129
             out[rows, DATA + 1] = 1
             rows += 1
-        elif kind == DBC_MISMATCH:  # SDO: expedited download of four bytes
-            write_header(out[rows], _SDO_TO_ECU, 8)
-            out[rows, DATA] = 0x23
-            put(out[rows], 8, 16, _MASTER_HASH_INDEX)
-            put(out[rows], 32, 32, injection.wrong_hash)
+        elif kind == DBC_MISMATCH:
+            write_hash(out[rows], injection.wrong_hash)
             rows += 1
         elif kind == SECOND_ECU:
             write_header(out[rows], injection.table[VALVES, ID], 8)

@@ -316,12 +316,13 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
 
 
 def recovery_frames(controller: str) -> np.ndarray:
-    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT; shape (3, 16)."""
+    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT, and the right DBC hash; (4, 16)."""
     return np.array(
         [
             nmt_frame(NMT_START, node=0),
             motion_frame(0, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
             motion_frame(0, REQUEST_RESET_FAULT),
+            injection.hash_frame(protocol.dbc_hash()),
         ],
         dtype=np.uint8,
     )
@@ -666,6 +667,9 @@ def recovery_frame(session: Session, mode: int, out: np.ndarray, rows: int) -> i
     elif mode in (MODE_STANDBY, MODE_HOLD):
         injection.copy_row(session.injection.row[1], out[rows])
     elif mode == MODE_FAULT:
+        if injection.wrong_hash_written(session.injection):
+            injection.copy_row(session.injection.row[3], out[rows])
+            rows += 1
         injection.copy_row(session.injection.row[2], out[rows])
     else:
         return rows  # on its way

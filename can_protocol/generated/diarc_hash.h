@@ -3,6 +3,6 @@
 #define DIARC_HASH_H
 
 /* First four bytes of the SHA-256 of can_protocol/diarc.dbc, line ends as LF. */
-#define DIARC_DBC_HASH 0x6515FE9Au
+#define DIARC_DBC_HASH 0xD279D51Fu
 
 #endif

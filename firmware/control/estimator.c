@@ -172,7 +172,7 @@ static void take_sample(struct estimator *e, const struct estimator_sample *samp
 
 _Static_assert(ROW_TURNS == 4, "sums of a window are written out");
 
-static scalar sum_of_window(const scalar sample[ROW_TURNS])
+scalar sum_of_window(const scalar sample[ROW_TURNS])
 {
     return sample[0] + sample[1] + sample[2] + sample[3];
 }
@@ -408,6 +408,13 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
     if (!e->follows_h) {
         e->follows_h = rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
     }
+}
+
+bool estimator_window_ended(const struct estimator *estimator, enum joint i)
+{
+    /* turn is that of the next tick; a joint's hydraulics come after the mechanics of both */
+    return estimator->samples > 2u * ROW_TURNS &&
+           estimator->turn == (uint8_t)((JOINTS + (uint8_t)i + 1u) % ROW_TURNS);
 }
 
 scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,

@@ -170,6 +170,13 @@ void estimator_step(struct estimator *estimator, const struct estimator_paramete
                     const struct estimator_constants *constants, const struct arm *arm,
                     const struct estimator_sample *sample);
 
+/* The last tick was the last of joint i's window: dq and flow of `window` and the hydraulics' force are of that. Not
+ * before the samples reach back to the window before. */
+bool estimator_window_ended(const struct estimator *estimator, enum joint i);
+
+/* Sum of a window's samples. */
+scalar sum_of_window(const scalar sample[ROW_TURNS]);
+
 /* Standard deviation of parameter k, in its unit. */
 scalar estimator_sd_m(const struct estimator *estimator, const struct estimator_constants *constants,
                       enum theta_m k);

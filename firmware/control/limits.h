@@ -8,15 +8,17 @@
 struct limits {
     scalar sensor_wrong_ticks;
     scalar rate[JOINTS];   /* rad/s */
-    scalar pressure_step;  /* Pa from one tick to the next */
+    scalar pressure_step;  /* Pa within 1 ms, or a tick if that is shorter */
     scalar pressure_range; /* Pa */
     scalar angle_range;    /* rad outside the joint's range */
     scalar stuck_travel;   /* rad */
     scalar stuck_s;
     scalar mismatch_updates;
-    scalar angle_margin; /* rad */
-    scalar pressure_max; /* Pa */
-    scalar pressure_min; /* Pa */
+    scalar contradiction; /* rad/s */
+    scalar spool_error;   /* of full travel */
+    scalar angle_margin;  /* rad */
+    scalar pressure_max;  /* Pa */
+    scalar pressure_min;  /* Pa */
     scalar persist_s;
     scalar tracking_error; /* rad */
     scalar saturation_s;

@@ -463,5 +463,8 @@ enum object_abort object_write(struct ecu *ecu, const struct ecu_port *port, con
     for (uint8_t k = 0; k < row->field_bytes; k++) {
         bytes[k] = (uint8_t)(value >> (8u * k));
     }
+    if (row->value == offsetof(struct ecu, heartbeat_consumer)) {
+        ecu->supervision.consumer_heard = false; /* watched from the first heartbeat on, 1016h */
+    }
     return OBJECT_DONE;
 }

@@ -149,6 +149,8 @@ enum ecu_refusal request_control_word(struct ecu *ecu, const struct ecu_port *po
         refusal = request_event(ecu, port, EVENT_RESET_FAULT);
     }
     if (refusal != REFUSAL_NONE) {
+        /* the edge has done nothing: the same word once more is another one */
+        ecu->control_word = (uint16_t)(word & ~CONTROL_RESET);
         return refusal;
     }
     switch (word & CONTROL_STATE_MASK) {

@@ -4,6 +4,8 @@
 #include "ecu/ecu.h"
 #include "ecu/wire.h"
 
+#define US_PER_STEP \
+    1000u /* the limit of a pressure's change is for a millisecond, or the tick if that is shorter */
 #define SENSOR_STATUS_INVALID DIARC_ENCODERS_SENSOR_STATUS_INVALID_CHOICE
 
 static scalar angle_of(int32_t raw)
@@ -22,6 +24,15 @@ static enum ecu_fault missing(const struct ecu *ecu, enum received_frame row)
     return ecu->receive.row[row].spoiled ? FAULT_SENSOR_FRAMES_CORRUPT : FAULT_SENSOR_FRAMES_LOST;
 }
 
+/* The sample a missing or wrong angle is replaced by: the reference and the observer's prediction. */
+static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
+{
+    const struct controller *const c = &ecu->controller;
+    const scalar e1 = c->observer[i].e + mul(ecu->constants.dt_s, c->observer[i].w);
+    const scalar q = trajectory_now(&c->trajectory[i]).q + e1;
+    return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
+}
+
 static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t raw, int32_t before)
 {
     const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
@@ -30,10 +41,15 @@ static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t r
     if (q < cylinder->q_min - beyond || q > cylinder->q_max + beyond) {
         return FAULT_SENSOR_RANGE;
     }
-    /* the sample before may be the prediction: an increment over one tick all the same */
+    if (!ecu->controller.armed) {
+        return FAULT_NONE;
+    }
+    /* The sample before may be a prediction. The arm is not far from this tick's: an encoder that was missing or refused
+     * has to come closer to that than one that is believed may move. */
+    const bool doubted = ecu->supervision.sensors_wrong > 0u;
     const scalar most = mul(ecu->machine.limits.rate[i], ecu->constants.dt_s);
-    const bool too_fast = ecu->controller.armed && absolute(angle_of(raw - before)) > most;
-    return too_fast ? FAULT_SENSOR_RATE : FAULT_NONE;
+    const scalar off = absolute(angle_of(raw - (doubted ? predicted_angle(ecu, i) : before)));
+    return off > (doubted ? mul(SCALAR(0.25), most) : most) ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
 static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t before)
@@ -45,8 +61,9 @@ static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t
     /* what was kept over missing frames may have changed meanwhile; a value that was refused may not */
     const enum ecu_fault cause = ecu->supervision.wrong_cause;
     const bool kept = cause == FAULT_SENSOR_FRAMES_LOST || cause == FAULT_SENSOR_FRAMES_CORRUPT;
-    const int32_t ticks = kept ? 1 + (int32_t)ecu->supervision.sensors_wrong : 1;
-    const scalar step = absolute(pressure_of(ecu, (raw - before) / ticks));
+    const uint32_t ticks = kept ? 1u + ecu->supervision.sensors_wrong : 1u;
+    const int32_t steps = (int32_t)((ticks * ecu->period_us + US_PER_STEP - 1u) / US_PER_STEP);
+    const scalar step = absolute(pressure_of(ecu, (raw - before) / steps));
     return ecu->controller.armed && step > limits->pressure_step ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
@@ -95,15 +112,6 @@ static enum ecu_fault take_pressures(const struct ecu *ecu, enum joint i, struct
         samples->spool[i] = raw.spool_position;
     }
     return wrong;
-}
-
-/* The sample a missing or wrong angle is replaced by: the reference and the observer's prediction. */
-static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
-{
-    const struct controller *const c = &ecu->controller;
-    const scalar e1 = c->observer[i].e + mul(ecu->constants.dt_s, c->observer[i].w);
-    const scalar q = trajectory_now(&c->trajectory[i]).q + e1;
-    return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
 }
 
 /* The later in this order says more: lost, corrupt, invalid, out of range, too fast. */

@@ -6,8 +6,11 @@
 #include "ecu/operation.h"
 #include "ecu/wire.h"
 
-#define OUTSIDE_TICKS 3u /* a limit is exceeded when it is for so many ticks in a row */
-#define REOPENED_MOST 3u /* changed loads within the window that are no loads any more */
+#define OUTSIDE_TICKS 3u                 /* a limit is exceeded when it is for so many ticks in a row */
+#define SPOOL_S SCALAR(0.01)             /* a spool may lag that long behind its set-point */
+#define STUCK_TICKS_LEAST 20u            /* noise may give the same raw value a few times */
+#define CONTRADICTION_SHARE SCALAR(0.25) /* of a window's, in the low pass */
+#define REOPENED_MOST 3u                 /* changed loads within the window that are no loads any more */
 #define DUPLICATE_TICKS 100u
 #define HEARTBEAT_BASE 0x700u
 #define ID_MASK 0x7Fu
@@ -22,6 +25,11 @@ static void count_u8(uint8_t *counter)
 static void count_u16(uint16_t *counter)
 {
     *counter = *counter < UINT16_MAX ? (uint16_t)(*counter + 1u) : UINT16_MAX;
+}
+
+static uint16_t at_least(uint16_t ticks, uint16_t least)
+{
+    return ticks < least ? least : ticks;
 }
 
 static uint16_t at_least_one_u16(uint32_t ticks)
@@ -52,7 +60,8 @@ void supervision_start(struct ecu *ecu)
     const uint32_t period_us = ecu->period_us;
     ecu->supervision = (struct supervision){
         .stop_ticks = ticks_of(limits->stop_s, period_us),
-        .stuck_ticks = ticks_of(limits->stuck_s, period_us),
+        .stuck_ticks = at_least(ticks_of(limits->stuck_s, period_us), STUCK_TICKS_LEAST),
+        .spool_ticks = ticks_of(SPOOL_S, period_us),
         .persist_ticks = ticks_of(limits->persist_s, period_us),
         .saturation_ticks = ticks_of(limits->saturation_s, period_us),
         .bound_ticks = ticks_of(limits->bound_s, period_us),
@@ -76,32 +85,16 @@ void supervision_arm(struct ecu *ecu, const struct measurement *measured)
         const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
         s->range[i][0] = smaller(cylinder->q_min, measured->q[i]) - margin;
         s->range[i][1] = larger(cylinder->q_max, measured->q[i]) + margin;
+        s->seen_angle[i] = ecu->samples.angle[i];
         s->stuck_travel[i] = SCALAR(0);
+        s->force[i] = ecu->controller.estimator.hydraulics[i].force;
+        s->contradiction[i] = SCALAR(0);
         s->stuck_for[i][BORE] = 0;
         s->stuck_for[i][ANNULUS] = 0;
     }
     s->reopened = ecu->controller.estimator.reopened;
     s->late_starts = 0;
     s->window = 0;
-}
-
-void supervise_sensors(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault wrong)
-{
-    struct supervision *const s = &ecu->supervision;
-    if (wrong == FAULT_NONE) {
-        s->sensors_wrong = 0;
-        (void)operation_event(ecu, EVENT_SENSORS_READY);
-        return;
-    }
-    count_u8(&s->sensors_wrong);
-    s->wrong_cause = wrong;
-    if (s->sensors_wrong <= s->wrong_limit) {
-        return;
-    }
-    if (ecu->controller.armed) {
-        fault_raise(ecu, port, wrong);
-    }
-    (void)operation_event(ecu, EVENT_SENSORS_GONE);
 }
 
 /* True once the condition has held for `ticks` in a row. */
@@ -113,6 +106,46 @@ static bool lasts(struct supervision *s, enum lasting which, bool condition, uin
     }
     count_u16(&s->lasting[which]);
     return s->lasting[which] >= ticks;
+}
+
+/* The set-points are those of the tick before: the law has not run yet. */
+static void watch_spools(struct ecu *ecu, const struct ecu_port *port)
+{
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        const scalar spool = WIRE_DECODE(ecu->samples.spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
+        const bool far = absolute(ecu->controller.output[i].u - spool) > ecu->machine.limits.spool_error;
+        if (lasts(&ecu->supervision, i == SWING ? LASTING_SPOOL_SWING : LASTING_SPOOL_WRIST, far,
+                  ecu->supervision.spool_ticks)) {
+            fault_raise(ecu, port, FAULT_VALVE_NOT_FOLLOWING);
+        }
+    }
+}
+
+void supervise_sensors(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault wrong)
+{
+    struct supervision *const s = &ecu->supervision;
+    if (wrong == FAULT_NONE) {
+        s->sensors_wrong = 0;
+        if (ecu->controller.armed) {
+            watch_spools(ecu, port);
+        }
+        (void)operation_event(ecu, EVENT_SENSORS_READY);
+        return;
+    }
+    count_u8(&s->sensors_wrong);
+    s->wrong_cause = wrong;
+    if (!supervision_sensors_gone(ecu)) {
+        return;
+    }
+    if (ecu->controller.armed) {
+        fault_raise(ecu, port, wrong);
+    }
+    (void)operation_event(ecu, EVENT_SENSORS_GONE);
+}
+
+bool supervision_sensors_gone(const struct ecu *ecu)
+{
+    return ecu->supervision.sensors_wrong > ecu->supervision.wrong_limit;
 }
 
 /* A fault that degrades: raised with its cause, cleared a second after it was last seen. */
@@ -137,14 +170,14 @@ static void watch_stuck(struct ecu *ecu, const struct ecu_port *port, enum joint
     const struct sensor_samples *const now = &ecu->samples;
     const scalar w = absolute(ecu->controller.output[i].reference.w);
     const bool replaced = s->sensors_wrong > 0u;
-    if (now->angle[i] != before->angle[i]) {
+    /* a predicted angle says nothing, but what the reference travels meanwhile counts */
+    if (!replaced && now->angle[i] != s->seen_angle[i]) {
+        s->seen_angle[i] = now->angle[i];
         s->stuck_travel[i] = SCALAR(0);
-    } else if (!replaced) {
-        s->stuck_travel[i] = add_limited(s->stuck_travel[i], mul(w, ecu->constants.dt_s));
     } else {
-        /* a predicted angle says nothing */
+        s->stuck_travel[i] = add_limited(s->stuck_travel[i], mul(w, ecu->constants.dt_s));
     }
-    bool stuck = s->stuck_travel[i] > ecu->machine.limits.stuck_travel;
+    bool stuck = !replaced && s->stuck_travel[i] > ecu->machine.limits.stuck_travel;
     for (uint8_t k = 0; k < CHAMBERS; k++) {
         if (now->pressure[i][k] != before->pressure[i][k]) {
             s->stuck_for[i][k] = 0;
@@ -157,6 +190,26 @@ static void watch_stuck(struct ecu *ecu, const struct ecu_port *port, enum joint
     }
     if (stuck) {
         fault_raise(ecu, port, FAULT_SENSOR_STUCK);
+    }
+}
+
+/* Encoder against oil. A joint's window ends with the tick of its hydraulics, of which the estimator keeps the samples:
+ *     lamA R w + F'/be - (QL - leakage) = 0, over lamA R: the rate that the two do not agree on. */
+static void watch_contradiction(struct ecu *ecu, const struct ecu_port *port, enum joint i)
+{
+    struct supervision *const s = &ecu->supervision;
+    const struct estimator *const e = &ecu->controller.estimator;
+    const struct estimator_constants *const constants = &ecu->constants.estimator;
+    const struct hydraulics *const h = &e->hydraulics[i];
+    const scalar w = amp(constants->per_window, sum_of_window(e->window.dq[i]));
+    const scalar oil = sum_of_window(e->window.flow[i]) -
+                       amp(constants->per_window, mul(e->theta_h[BETA_INVERSE], h->force - s->force[i]));
+    const scalar oil_w = quot(oil, h->lamA_R);
+    s->force[i] = h->force;
+    s->contradiction[i] += mul(CONTRADICTION_SHARE, w - oil_w - s->contradiction[i]);
+    const scalar most = ecu->machine.limits.contradiction + mul(SCALAR(0.25), absolute(oil_w));
+    if (absolute(s->contradiction[i]) > most) {
+        fault_raise(ecu, port, FAULT_SENSORS_CONTRADICT);
     }
 }
 
@@ -234,6 +287,9 @@ static void watch_arm(struct ecu *ecu, const struct ecu_port *port, const struct
     for (uint8_t i = 0; i < JOINTS; i++) {
         watch_joint(ecu, port, (enum joint)i, measured);
         watch_stuck(ecu, port, (enum joint)i, before);
+        if (estimator_window_ended(&ecu->controller.estimator, (enum joint)i)) {
+            watch_contradiction(ecu, port, (enum joint)i);
+        }
     }
 }
 

@@ -17,6 +17,8 @@ enum lasting {
     LASTING_SATURATED_SWING,
     LASTING_SATURATED_WRIST,
     LASTING_AT_BOUND,
+    LASTING_SPOOL_SWING, /* far from its set-point */
+    LASTING_SPOOL_WRIST,
     LASTING
 };
 
@@ -25,15 +27,18 @@ enum clearing { CLEARING_MISMATCH, CLEARING_CAVITATION, CLEARING_BOUND, CLEARING
 
 struct supervision {
     /* limits in ticks and counts, made once from the parameters */
-    uint16_t stop_ticks, stuck_ticks, persist_ticks, saturation_ticks, bound_ticks, second_ticks;
+    uint16_t stop_ticks, stuck_ticks, spool_ticks, persist_ticks, saturation_ticks, bound_ticks, second_ticks;
     uint8_t wrong_limit, mismatch_limit, late_limit, send_limit;
 
     uint8_t sensors_wrong;      /* ticks in a row that sensors were missing or wrong; stops at 255 */
     enum ecu_fault wrong_cause; /* of the last of them */
     uint16_t lasting[LASTING];
     scalar range[JOINTS][2];              /* low and high ends of the joints, rad */
-    scalar stuck_travel[JOINTS];          /* of the reference since the encoder's raw value changed, rad */
+    int32_t seen_angle[JOINTS];           /* the encoder's last raw value; never a predicted one */
+    scalar stuck_travel[JOINTS];          /* of the reference since it changed, rad */
     uint16_t stuck_for[JOINTS][CHAMBERS]; /* ticks of motion since a pressure's raw value changed */
+    scalar force[JOINTS];                 /* of the cylinder at the end of the window before */
+    scalar contradiction[JOINTS];         /* rate by the encoder less that by the oil, low-passed; rad/s */
     uint16_t reopened;                    /* the estimator's count when the window began */
     uint16_t window;                      /* ticks of the window of late starts and reopened loads */
     uint16_t clear[CLEARING];             /* ticks until they leave */
@@ -52,6 +57,9 @@ void supervision_arm(struct ecu *ecu, const struct measurement *measured);
 
 /* This tick's samples, as samples_take judged them: modes that follow, and the faults of sensors. */
 void supervise_sensors(struct ecu *ecu, const struct ecu_port *port, enum ecu_fault wrong);
+
+/* So many ticks in a row without good sensors that it is a fault. */
+bool supervision_sensors_gone(const struct ecu *ecu);
 
 /* After the law: the machine's limits. before: the samples of the tick before. */
 void supervise_machine(struct ecu *ecu, const struct ecu_port *port, const struct sensor_samples *before,

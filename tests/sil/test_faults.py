@@ -40,6 +40,15 @@ SUBSET = [
     ("nmt_reset", "", "rest", "realistic", {}),
     ("ecu_killed", "", "top", "paper", {}),
     ("load_dropped", "", "top", "paper", {"size": 0.0}),
+    ("dropped", "valves", "top", "paper", {"size": 1.0, "duration_s": 0.2}),
+    ("stuck", "swing_angle", "end", "paper", {}),
+    ("stuck", "wrist_bore", "top", "realistic", {}),
+    ("biased", "wrist_bore", "rest", "realistic", {"size": 4e6}),
+    ("biased", "wrist_spool", "end", "paper", {"size": 0.5}),
+    ("spiked", "wrist_bore", "rest", "paper", {"size": 5e6}),
+    ("noisy", "wrist_annulus", "rest", "paper", {"size": 4e6}),
+    ("dbc_mismatch", "", "top", "paper", {}),
+    ("supply_lost", "", "end", "paper", {"size": 0.01}),
 ]
 
 
@@ -96,6 +105,11 @@ def test_rules_do_not_pass_what_they_are_there_to_catch(stopped: tuple[Cell, fau
     code = record.emergency.copy()
     code[0, 2] = 2
     assert "SENSOR_INVALID instead of" in judge(cell, with_record(good, emergency=code), good).why
+
+    number = record.emergency.copy()
+    number[0, 1] = 0x8110
+    why = judge(cell, with_record(good, emergency=number), good).why
+    assert "SENSOR_FRAMES_LOST with error code 8110h instead of 8100h" in why
 
     outside = good.session.monitor.whole.copy()
     outside[session.OUTSIDE] = 1

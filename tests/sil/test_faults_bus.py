@@ -11,9 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from sil_plant import frames, protocol, session
 from sil_plant.buses import BusError, connect_python_can
+from sil_plant.hub import Hub
 
 LIMIT_S = 60.0
+SILENCE_LIMIT_S = 10.0
 PAUSED = "this machine paused the plant"
 
 MOVE = """
@@ -65,6 +68,44 @@ def test_bus_does_not_give_another_trace_of_a_fault(both, fault: str) -> None:
     inproc, tcp = both(f"{fault}start_s = 0.3\nrecover_after_s = 0.2\n")
     assert tcp["ticks"] == inproc["ticks"] == 1601
     assert tcp["trace_sha256"] == inproc["trace_sha256"]
+
+
+def test_dead_plant_does_not_keep_the_ecu_ramping_for_long(bench, start_ecu) -> None:
+    """GIVEN an ECU in lockstep in RUN WHEN the plant pauses for 20 ms THEN it stays in RUN
+    WHEN the plant falls silent THEN its valves are shut after the five ticks and the ramp: once it is sure that the
+    sensors are gone, a tick takes no longer than its period, not as long as a pause may take (205 of those are 20 s).
+    """
+    rig = bench()
+    valves = protocol.database().get_message_by_name("VALVES")
+    mode, run_ticks, silent_ticks, end = "", 0, 0, time.monotonic() + LIMIT_S
+    with Hub("127.0.0.1", 0) as hub:
+        start_ecu(f"tcp:127.0.0.1:{hub.port}", "--pace", "lockstep")
+        while mode != "FAULT":
+            assert time.monotonic() < end, f"{mode} after {run_ticks} ticks in RUN, {silent_ticks} in silence"
+            frame = hub.receive(0.1)
+            if frame is None:
+                continue
+            can_id, data = frame
+            if can_id == valves.frame_id:
+                mode = str(valves.decode(data)["Mode"])
+                assert silent_ticks or mode in ("INIT", "STANDBY", "RUN")
+                run_ticks += mode == "RUN"
+            elif can_id == protocol.SYNC_ID and run_ticks < 50:
+                if run_ticks in (20, 30, 40):
+                    time.sleep(0.02)
+                rig.sync = data[0]
+                rows = rig.sensors()
+                if not mode:
+                    rows.insert(0, session.nmt_frame(session.NMT_START))
+                elif mode == "STANDBY":
+                    rows.insert(0, rig.motion("RUN", Controller=0))
+                hub.send_many(frames.from_row(row) for row in rows)
+            elif can_id == protocol.SYNC_ID:
+                if not silent_ticks:
+                    end = time.monotonic() + SILENCE_LIMIT_S
+                silent_ticks += 1
+    assert run_ticks >= 50
+    assert 204 <= silent_ticks <= 206
 
 
 def test_monitor_that_comes_and_goes_does_not_disturb(start_run_py, simulate, tmp_path: Path) -> None:

@@ -514,6 +514,22 @@ static void test_watched_node_out_of_range_taken(void)
     TEST_ASSERT_EQUAL_HEX32(127u << 16 | 500u, number(0x1016, 1));
 }
 
+static void test_silence_of_the_node_before_blamed_on_the_next(void)
+{
+    /* GIVEN RUN with the I/O node watched and heard WHEN another node is watched in its place, for a shorter time THEN
+     * no fault before that one was heard once */
+    to_run();
+    queue((struct can_frame_11bit){.id = 0x702, .length = 1, .data = {5}});
+    ticks(400);
+    TEST_ASSERT_TRUE(ecu.supervision.consumer_heard);
+    TEST_ASSERT_EQUAL_HEX32(0, write_number(0x1016, 1, 3u << 16 | 100u, 4));
+    ticks(200);
+    TEST_ASSERT_EQUAL_HEX32(0, ecu.active_faults);
+    queue((struct can_frame_11bit){.id = 0x703, .length = 1, .data = {5}});
+    ticks(102);
+    TEST_ASSERT_EQUAL_HEX32(1u << FAULT_HEARTBEAT_LOST, ecu.active_faults);
+}
+
 static void test_control_word_not_followed(void)
 {
     /* GIVEN the control word WHEN written THEN modes follow as their requests would, or it is refused for the state
@@ -574,6 +590,7 @@ int main(void)
     RUN_TEST(test_error_history_in_another_order);
     RUN_TEST(test_heartbeat_time_ignored);
     RUN_TEST(test_watched_node_out_of_range_taken);
+    RUN_TEST(test_silence_of_the_node_before_blamed_on_the_next);
     RUN_TEST(test_control_word_not_followed);
     return UNITY_END();
 }
