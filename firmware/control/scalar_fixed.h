@@ -175,6 +175,8 @@ static inline scalar narrow(wide sum)
     return FIXED_ROUNDED(sum, SCALAR_FRACTION, 30);
 }
 
+scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits);
+
 /* part / whole of two counts, part <= whole < 2^31. */
 scalar fraction(uint32_t part, uint32_t whole);
 

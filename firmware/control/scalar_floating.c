@@ -78,11 +78,6 @@ static scalar power_of_two(int16_t exponent)
     return value;
 }
 
-scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
-{
-    return (scalar)raw / (scalar)((uint32_t)1 << fraction_bits);
-}
-
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high)
 {
     const scalar scaled = x * (scalar)((uint32_t)1 << fraction_bits);

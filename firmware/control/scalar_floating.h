@@ -96,6 +96,11 @@ static inline scalar narrow(wide sum)
     return sum;
 }
 
+static inline scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
+{
+    return (scalar)raw / (scalar)((uint32_t)1 << fraction_bits);
+}
+
 static inline scalar fraction(uint32_t part, uint32_t whole)
 {
     return (scalar)part / (scalar)whole;
