@@ -48,8 +48,8 @@ static inline scalar limit(scalar x, scalar low, scalar high)
 /* A function whose variables must not lie on the stack below what its caller calls besides it. */
 #define OWN_FRAME __attribute__((noinline))
 
-/* The number type's own sine, |x| <= pi/2. */
-scalar sine_quarter(scalar x);
+/* A function that runs once, or when a mode begins: made small instead of fast. */
+#define SELDOM __attribute__((cold))
 
 /* Sine and cosine of an angle in rad, |x| <= 2 pi. Error at most 5e-16 (double), 2.8e-7 (float, 1.6e-7 within
  * pi and fixed). */
