@@ -8,7 +8,8 @@ Examples
 
 The stack is the deepest path of the call graph (gcc's -fcallgraph-info=su, with the calls found in the machine code)
 plus the deepest interrupt; recursion, a frame of unknown size and an indirect call without known targets are errors.
-Instructions are counted by SysTick in QEMU with -icount, of every tick of runs with all laws and a tare.
+Instructions are counted by SysTick in QEMU with -icount, of every tick of runs with all laws and a tare, and of one
+through every mode with a master that reads by SDO meanwhile (budget_modes.py).
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from sil_plant.buses import BusError, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine  # noqa: E402
 from sil_plant.scenario import DEFAULT_SCENARIO, LoadStep, Scenario, load_scenario  # noqa: E402
-from tools import budget_floor  # noqa: E402
+from tools import budget_floor, budget_modes  # noqa: E402
 
 BUDGET_PATH = ROOT / "build" / "budget.json"
 RECORD_PATH = ROOT / "tests" / "pil" / "budget_record.json"
@@ -59,9 +60,10 @@ COUNT = "-DDIARC_COUNT_INSTRUCTIONS=ON"
 
 # The run that is counted: what is carried changes on the way, so that the estimator also starts its filters anew.
 LOADS = (LoadStep(0.0, 2.5), LoadStep(1.0, 7.5))
-# Law and how long; the mean is of the first, the maximum of all.
-RUNS = (("diarc", 3.0), ("pid", 1.0), ("diarc-noload", 1.0))
-SHORT_RUNS = (("diarc", 3.0), ("pid", 0.5), ("diarc-noload", 0.5))
+# Law and how long; the mean is of the first, the maximum of all. MODES is the run through every mode.
+MODES = "modes"
+RUNS = (("diarc", 3.0), ("pid", 1.0), ("diarc-noload", 1.0), (MODES, budget_modes.DURATION_S))
+SHORT_RUNS = (("diarc", 3.0), ("pid", 0.5), ("diarc-noload", 0.5), (MODES, budget_modes.DURATION_S))
 ATTEMPTS = 3  # of a check, before it says that instructions have grown
 
 # Registers that the processor itself pushes when an interrupt comes, with the word that aligns the stack.
@@ -361,6 +363,14 @@ def counted_scenario() -> Scenario:
 Runs = tuple[tuple[str, float], ...]
 
 
+def make_run(machine: Machine, scenario: Scenario, law: str, duration_s: float) -> session.Session:
+    """One of the runs."""
+    if law == MODES:
+        return budget_modes.make(machine, scenario)
+    scenario = replace(scenario, duration_s=duration_s)
+    return session.make_session(machine, scenario, law, scenario.seed, execution.PERIOD_US * 1e-6, True)
+
+
 def count(image: Image, elf: Path, machine: Machine, runs: Runs) -> tuple[dict[str, tuple[int, int]], int]:
     """Mean and most instructions of each stage over the runs, and the stack that was seen in use.
 
@@ -371,11 +381,9 @@ def count(image: Image, elf: Path, machine: Machine, runs: Runs) -> tuple[dict[s
     ticks, sums = [0], [dict.fromkeys(emulated_board.STAGES, 0)]
     with EmulatedBoard(image, elf, counting=True) as board:
         for law, duration_s in runs:
-            run = session.make_session(
-                machine, replace(scenario, duration_s=duration_s), law, scenario.seed, execution.PERIOD_US * 1e-6, True
-            )
+            run = make_run(machine, scenario, law, duration_s)
             execution.over_bus(run, parse_bus(board.bus), None, b"", lambda _: board.check(), True)
-            failed = execution.outcome(run)
+            failed = budget_modes.failure(run) if law == MODES else execution.outcome(run)
             if failed is not None:
                 raise BudgetError(f"the counted run under {law} failed: {failed}")
             figures = board.figures()  # of all runs so far

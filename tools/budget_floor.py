@@ -122,6 +122,7 @@ def terms() -> list[tuple[str, Operations]]:
             JOINTS * (step_of_estimate + 2 * ROW_COLUMNS * Operations(mul=1, add=1)),
         ),
         ("inertia, flow offsets and their bounds", Operations(mul=4, add=4) + JOINTS * Operations(mul=4, add=2)),
+        ("uncertainty of 1/be as a share of it", Operations(div=1)),
         ("DIARC step 1 and 2", JOINTS * Operations(mul=27, add=21, div=1)),
         ("opening, robust integrals", JOINTS * Operations(mul=4, add=5, div=1)),
         ("spool: overlap and lead", JOINTS * Operations(mul=3, add=3)),

@@ -106,17 +106,28 @@ def real32_bits(value: float) -> str:
 
 
 def parameter_sources() -> dict[Path, str]:
-    """The parameter table, its names, and the image of the reference arm as the built-in default."""
+    """The parameter table, its names, and the image of the reference arm as the built-in default.
+
+    What many parameters share, limits and quantities, is in tables of their own, so that a row is four bytes.
+    """
     table = load_parameter_table()
+    limits = sorted({limit for entry in table.entries for limit in (entry.low, entry.high)})
+    quantities = sorted({(entry.gain, *entry.exponents) for entry in table.entries})
+    if max(len(limits), len(quantities)) > 256:
+        raise ValueError("a row of the parameter table has one byte for each of its indices")
     rows, names = [], []
     for entry in table.entries:
-        kind = "PARAMETER_GAIN" if entry.gain else "PARAMETER_SCALAR"
-        exponents = ", ".join(str(e) for e in entry.exponents)
+        quantity = quantities.index((entry.gain, *entry.exponents))
         rows.append(
-            f"    {{offsetof(struct machine, {entry.field}), {kind}, {{{exponents}}}, "
-            f"{real32_bits(entry.low)}, {real32_bits(entry.high)}}}, /* {entry.name}: {entry.text} */\n"
+            f"    {{FIELD({entry.field}), {quantity}, {limits.index(entry.low)}, {limits.index(entry.high)}}}, "
+            f"/* {entry.name}: {entry.text} */\n"
         )
         names.append(f'    "{entry.name}",\n')
+    limit_rows = [f"    {real32_bits(limit)}, /* {limit:g} */\n" for limit in limits]
+    quantity_rows = [
+        f"    {{{'PARAMETER_GAIN' if gain else 'PARAMETER_SCALAR'}, {{{', '.join(str(e) for e in exponents)}}}}},\n"
+        for gain, *exponents in quantities
+    ]
     image = parameter_image(load_machine(REFERENCE_ARM))
     lines = [
         "    " + ", ".join(f"0x{byte:02X}" for byte in image[at : at + 16]) + ",\n" for at in range(0, len(image), 16)
@@ -137,6 +148,8 @@ def parameter_sources() -> dict[Path, str]:
     return {
         ECU_DIR / "parameter_layout.h": count_header,
         ECU_DIR / "parameter_table.inc": NOTICE + "".join(rows),
+        ECU_DIR / "parameter_limits.inc": NOTICE + "".join(limit_rows),
+        ECU_DIR / "parameter_quantities.inc": NOTICE + "".join(quantity_rows),
         ECU_DIR / "parameter_names.inc": NOTICE + "".join(names),
         ECU_DIR / "default_image.inc": NOTICE + "".join(lines),
     }

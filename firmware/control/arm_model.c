@@ -2,11 +2,6 @@
 
 #define TWO_OVER_PI SCALAR(0.63661977236758134308)
 
-const uint8_t row_parameter[JOINTS][ROW_COLUMNS] = {
-    [SWING] = {M_T, J, M2, FV1, FC1, OM1},
-    [WRIST] = {M_T, J, M2, FV2, FC2, OM2},
-};
-
 struct wrist_trig wrist_trig(const struct arm *arm, scalar q2)
 {
     const struct sine_cosine at = sine_cosine(q2);
@@ -21,7 +16,9 @@ scalar coulomb_sign(const struct arm *arm, scalar w)
 void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
                   struct arm_row *row)
 {
-    *row = (struct arm_row){0};
+    row->phi[COL_FV] = SCALAR(0);
+    row->phi[COL_FC] = SCALAR(0);
+    row->phi[COL_OM] = SCALAR(0);
     if (i == SWING) { /* H11 q1', Eq 2 */
         row->phi[COL_M_T] = mul(mul(t->r, t->r), w[SWING]);
         row->phi[COL_J] = mul(mul(t->c, t->c), w[SWING]);
@@ -30,6 +27,8 @@ void arm_momentum(const struct arm *arm, const struct wrist_trig *t, enum joint 
     } else { /* H22 q2' */
         row->phi[COL_M_T] = mul(mul(arm->L2, arm->L2), w[WRIST]);
         row->phi[COL_J] = w[WRIST];
+        row->phi[COL_M2] = SCALAR(0);
+        row->known = SCALAR(0);
     }
 }
 
@@ -56,7 +55,10 @@ static void friction_and_offset(scalar w, scalar sign, scalar lever, struct arm_
 void arm_force(const struct arm *arm, const struct wrist_trig *t, enum joint i, const scalar w[JOINTS],
                scalar sign, scalar lever, struct arm_row *row)
 {
-    *row = (struct arm_row){0};
+    row->phi[COL_M_T] = SCALAR(0);
+    row->phi[COL_J] = SCALAR(0);
+    row->phi[COL_M2] = SCALAR(0);
+    row->known = SCALAR(0);
     if (i == WRIST) {
         wrist_centrifugal_and_gravity(arm, t, w[SWING], row);
     }
@@ -84,7 +86,7 @@ scalar arm_row_torque(const struct arm_row *row, enum joint i, const scalar thet
 {
     wide torque = wide_of(row->known);
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        torque = add_product(torque, row->phi[k], theta[row_parameter[i][k]]);
+        torque = add_product(torque, row->phi[k], theta[row_parameter(i, k)]);
     }
     return narrow(torque);
 }

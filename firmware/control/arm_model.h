@@ -7,7 +7,7 @@
  *     H11 = I1 + m2 L1 r + J c^2 + m_t r^2,  H22 = J + m_t L2^2,  r = L1 + L2 c,  c = cos q2, s = sin q2
  *
  * Both rows are linear in theta_m = [m_t J m2 fv1 fv2 fc1 fc2 Om1 Om2]: (Eq 10). Each row holds six of the
- * nine; a "row" below has only those six columns, and row_parameter says which they are. Where the printed
+ * nine; a "row" below has only those six columns, and row_parameter() says which they are. Where the printed
  * equations differ from these, and why these are right: docs/paper.md. */
 #ifndef CONTROL_ARM_MODEL_H
 #define CONTROL_ARM_MODEL_H
@@ -21,7 +21,18 @@ enum theta_m { M_T, J, M2, FV1, FV2, FC1, FC2, OM1, OM2, THETA_M };
 
 /* Columns of one row. */
 enum row_column { COL_M_T, COL_J, COL_M2, COL_FV, COL_FC, COL_OM, ROW_COLUMNS };
-extern const uint8_t row_parameter[JOINTS][ROW_COLUMNS];
+
+/* Which of theta column k of joint i's row belongs to. By arithmetic, not by a table: where a loop over the columns is
+ * unrolled it costs nothing. */
+static inline uint8_t row_parameter(enum joint i, uint8_t k)
+{
+    return k < COL_FV ? k : (uint8_t)(2u * k - COL_FV + (uint8_t)i);
+}
+
+_Static_assert((int)M_T == (int)COL_M_T && (int)J == (int)COL_J && (int)M2 == (int)COL_M2,
+               "both joints have the first three");
+_Static_assert((int)FV1 == (int)COL_FV && FV2 == FV1 + 1 && FC1 == FV1 + 2 && OM1 == FV1 + 4,
+               "of the others each has one of a pair");
 
 /* What of the arm is known for good. */
 struct arm {

@@ -1,6 +1,6 @@
 #include "control/controller.h"
 
-struct controller_constants controller_constants(const struct machine *machine, scalar dt_s)
+SELDOM struct controller_constants controller_constants(const struct machine *machine, scalar dt_s)
 {
     struct controller_constants constants = {.dt_s = dt_s};
     for (uint8_t i = 0; i < JOINTS; i++) {
@@ -11,14 +11,14 @@ struct controller_constants controller_constants(const struct machine *machine, 
     return constants;
 }
 
-void controller_start(struct controller *controller, const struct machine *machine,
-                      const struct controller_constants *constants)
+SELDOM void controller_start(struct controller *controller, const struct machine *machine,
+                             const struct controller_constants *constants)
 {
     *controller = (struct controller){.kind = CONTROLLER_DIARC};
     estimator_start(&controller->estimator, &machine->estimator, &constants->estimator);
 }
 
-void controller_arm(struct controller *controller, enum controller_kind kind, const scalar q[JOINTS])
+SELDOM void controller_arm(struct controller *controller, enum controller_kind kind, const scalar q[JOINTS])
 {
     controller->kind = kind;
     controller->armed = true;
@@ -98,8 +98,9 @@ static struct row_torques row_torques(const struct arm_row *row, enum joint i, c
     wide torque = wide_of(row->known);
     wide uncertainty = wide_of(SCALAR(0));
     wide step = wide_of(SCALAR(0));
+    UNROLL_SHORT_LOOP
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        const uint8_t parameter = row_parameter[i][k];
+        const uint8_t parameter = row_parameter(i, k);
         const scalar phi = row->phi[k];
         torque = add_product(torque, phi, theta[parameter]);
         uncertainty = add_product(uncertainty, absolute(phi), range[parameter]);
@@ -111,7 +112,7 @@ static struct row_torques row_torques(const struct arm_row *row, enum joint i, c
 static scalar diarc_joint(struct controller *controller, const struct machine *machine,
                           const struct controller_constants *constants, const struct estimator_sample *sample,
                           const struct joint_flow *flow, enum joint i, const scalar theta[THETA_M],
-                          const struct wrist_trig *desired, struct joint_output *out)
+                          const struct wrist_trig *desired, scalar beta_share, struct joint_output *out)
 {
     const scalar w[JOINTS] = {controller->output[SWING].reference.w, controller->output[WRIST].reference.w};
     const scalar a[JOINTS] = {controller->output[SWING].reference.a, controller->output[WRIST].reference.a};
@@ -134,7 +135,7 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
         .torque_step = torques.step,
         .H = arm_inertia(&machine->arm, desired, i, theta),
         .beta_inverse = theta_h[BETA_INVERSE],
-        .beta_uncertainty = ranges->scale_h[BETA_INVERSE],
+        .beta_share = beta_share,
         .flow_offset = mul(c->lamB, theta_h[om2]) + mul(c->lamC, theta_h[om3]),
         .flow_uncertainty = mul(c->lamB, ranges->scale_h[om2]) + mul(c->lamC, ranges->scale_h[om3]),
         .cylinder = *c,
@@ -197,10 +198,12 @@ OWN_FRAME static void diarc_law(struct controller *controller, const struct mach
         before[k] = theta[k]; /* no step of the estimate before the first tick */
     }
     const struct wrist_trig desired = wrist_trig(&machine->arm, controller->output[WRIST].reference.q);
+    const scalar beta_share =
+        quot(constants->estimator.scale_h[BETA_INVERSE], controller->estimator.law_h[BETA_INVERSE]);
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct joint_output *const out = &controller->output[i];
         const scalar u = diarc_joint(controller, machine, constants, sample, &flow[i], (enum joint)i, theta,
-                                     &desired, out);
+                                     &desired, beta_share, out);
         /* the set-point leads by a share of the spool's measured lag */
         const scalar spool = valve_spool(&machine->cylinder[i], u);
         const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);

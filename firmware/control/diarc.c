@@ -47,9 +47,8 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
     s.e3 = in->force - s.F_Ld;
     const scalar w = in->reference_w + in->e1_rate;
     const scalar mu = -mul(gains->w1_over_w2, mul(R, s.e2)); /* Eq 18 */
-    const scalar beta_share = quot(in->beta_uncertainty, in->beta_inverse);
     const scalar k2s2 =
-        robust_gain(gains->gamma2_max + in->flow_uncertainty + mul(beta_share, absolute(F_Ld_flow)),
+        robust_gain(gains->gamma2_max + in->flow_uncertainty + mul(in->beta_share, absolute(F_Ld_flow)),
                     gains->eta2, amp(gains->k2s2_max, in->beta_inverse));
     /* Eq 18, 20: what the motion takes, less what the offsets give and the feedback asks */
     const scalar motion = add_limited(mul(in->cylinder.lamA, mul(R, w)), F_Ld_flow);
@@ -59,7 +58,7 @@ static struct two_steps two_steps(const struct diarc *diarc, const struct diarc_
     return s;
 }
 
-void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in)
+SELDOM void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in)
 {
     /* at rest on the reference F_Ld = (torque_ff - gamma1) / R, so this makes e3 = 0 */
     const scalar measured = mul(in->cylinder.R, in->force);

@@ -32,7 +32,7 @@ struct diarc_input {
     scalar torque_step;        /* phi2' (theta^_k - theta^_(k-1)): by how much the estimate moved torque_ff */
     scalar H;                  /* inertia at theta^, kg m^2 */
     scalar beta_inverse;       /* theta_8 = 1/be^ */
-    scalar beta_uncertainty;   /* theta_8's range */
+    scalar beta_share;         /* theta_8's range over theta_8 */
     scalar flow_offset;        /* d^ = lamB Om2^ + lamC Om3^, m^2/s */
     scalar flow_uncertainty;   /* |d_max - d_min|, m^2/s */
     struct cylinder_state cylinder;

@@ -14,7 +14,8 @@ static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
     [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
 };
 
-struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s)
+SELDOM struct estimator_constants estimator_constants(const struct estimator_parameters *parameters,
+                                                      scalar dt_s)
 {
     struct estimator_constants constants = {0};
     const scalar window_s = mul(dt_s, SCALAR(ROW_TURNS));
@@ -46,8 +47,8 @@ struct estimator_constants estimator_constants(const struct estimator_parameters
 /* Commissioning knows a parameter to a quarter of its range. */
 #define WIDE_SD SCALAR(0.25)
 
-static void start_covariance(const struct prior prior[], uint8_t size, const scalar scale[],
-                             struct ud_factors *covariance)
+SELDOM static void start_covariance(const struct prior prior[], uint8_t size, const scalar scale[],
+                                    struct ud_factors *covariance)
 {
     variance P[UD_SIZE_MAX];
     for (uint8_t k = 0; k < size; k++) {
@@ -56,8 +57,8 @@ static void start_covariance(const struct prior prior[], uint8_t size, const sca
     ud_start(covariance, size, P);
 }
 
-static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
-                        scalar law[], struct ud_factors *covariance)
+SELDOM static void start_block(const struct prior prior[], uint8_t size, const scalar scale[], scalar theta[],
+                               scalar law[], struct ud_factors *covariance)
 {
     for (uint8_t k = 0; k < size; k++) {
         theta[k] = prior[k].value;
@@ -66,8 +67,8 @@ static void start_block(const struct prior prior[], uint8_t size, const scalar s
     start_covariance(prior, size, scale, covariance);
 }
 
-void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
-                     const struct estimator_constants *constants)
+SELDOM void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
+                            const struct estimator_constants *constants)
 {
     *estimator = (struct estimator){0};
     start_block(parameters->m, THETA_M, constants->scale_m, estimator->theta_m, estimator->law_m,
@@ -77,7 +78,7 @@ void estimator_start(struct estimator *estimator, const struct estimator_paramet
     estimator_resume(estimator);
 }
 
-void estimator_commission(struct estimator *estimator)
+SELDOM void estimator_commission(struct estimator *estimator)
 {
     variance open[UD_SIZE_MAX];
     for (uint8_t k = 0; k < UD_SIZE_MAX; k++) {
@@ -92,8 +93,8 @@ void estimator_commission(struct estimator *estimator)
     estimator_resume(estimator);
 }
 
-void estimator_operate(struct estimator *estimator, const struct estimator_parameters *parameters,
-                       const struct estimator_constants *constants)
+SELDOM void estimator_operate(struct estimator *estimator, const struct estimator_parameters *parameters,
+                              const struct estimator_constants *constants)
 {
     start_covariance(parameters->m, THETA_M, constants->scale_m, &estimator->covariance_m);
     start_covariance(parameters->h, THETA_H, constants->scale_h, &estimator->covariance_h);
@@ -104,7 +105,7 @@ void estimator_operate(struct estimator *estimator, const struct estimator_param
 }
 
 /* Empty filters; the balances go on from the samples that are there. */
-static void start_filters(struct estimator *estimator)
+SELDOM static void start_filters(struct estimator *estimator)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct mechanics *const m = &estimator->mechanics[i];
@@ -124,7 +125,7 @@ static void start_filters(struct estimator *estimator)
     estimator->ramp = SCALAR(0);
 }
 
-void estimator_resume(struct estimator *estimator)
+SELDOM void estimator_resume(struct estimator *estimator)
 {
     start_filters(estimator);
     estimator->samples = 0;
@@ -320,7 +321,7 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
     scalar phi[THETA_M] = {0};
     scalar residual = -e->mechanics[i].column[ROW_COLUMNS].second;
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        const uint8_t parameter = row_parameter[i][k];
+        const uint8_t parameter = row_parameter(i, k);
         const scalar column = e->mechanics[i].column[k].second;
         residual -= mul(column, e->theta_m[parameter]);
         phi[parameter] = mul(column, constants->scale_m[parameter]);

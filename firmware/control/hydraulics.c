@@ -7,7 +7,7 @@ static scalar cylinder_length(const struct cylinder_constants *constants, scalar
     return root(constants->a2_plus_b2 - mul(SCALAR(2), mul(constants->ab, cosine_of_triangle)));
 }
 
-struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
+SELDOM struct cylinder_constants cylinder_constants(const struct cylinder *cylinder)
 {
     struct cylinder_constants constants = {0};
     const scalar bore_squared = mul(cylinder->bore, cylinder->bore);

@@ -3,7 +3,7 @@
 /* No joint of any machine is faster, rad/s; an encoder that jumps could otherwise drive the state anywhere. */
 #define RATE_LIMIT SCALAR(30)
 
-struct observer_constants observer_constants(gain bandwidth, scalar dt_s)
+SELDOM struct observer_constants observer_constants(gain bandwidth, scalar dt_s)
 {
     /* rho = exp(-x) by the (2,2) Pade approximant, error below 2e-3 for x <= 1: the pole need not be exact */
     const scalar x = amp(bandwidth, dt_s);

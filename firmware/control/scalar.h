@@ -48,8 +48,8 @@ static inline scalar limit(scalar x, scalar low, scalar high)
 /* A function whose variables must not lie on the stack below what its caller calls besides it. */
 #define OWN_FRAME __attribute__((noinline))
 
-/* The number type's own sine, |x| <= pi/2. */
-scalar sine_quarter(scalar x);
+/* A function that runs once, or when a mode begins: made small instead of fast. */
+#define SELDOM __attribute__((cold))
 
 /* Sine and cosine of an angle in rad, |x| <= 2 pi. Error at most 5e-16 (double), 2.8e-7 (float, 1.6e-7 within
  * pi and fixed). */
@@ -66,8 +66,7 @@ struct sine_cosine sine_cosine(scalar x);
  * as a ratio it needs no quotient beyond 1. */
 scalar arctangent(scalar y, scalar x);
 
-/* raw * 2^-fraction_bits, for |raw| < 2^31 and 0 <= fraction_bits <= 31. */
-scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits);
+/* scalar_from_raw(raw, fraction_bits) is raw * 2^-fraction_bits, for |raw| < 2^31 and 0 <= fraction_bits <= 31. */
 
 /* x * 2^fraction_bits to the nearest integer, halves away from zero, limited to low..high. */
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high);

@@ -33,10 +33,13 @@ static scalar odd_polynomial(const int32_t *coefficient, int32_t x)
     return fixed_shifted((int64_t)p * x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
 }
 
-scalar sine_quarter(scalar x)
+/* |x| <= pi/2 */
+static inline scalar sine_quarter(scalar x)
 {
     return odd_polynomial(SINE, x * (1 << (ARGUMENT_FRACTION - SCALAR_FRACTION)));
 }
+
+#include "control/scalar_sine.inc"
 
 scalar arctangent(scalar y, scalar x)
 {
@@ -185,7 +188,7 @@ inverse scale_inverse(inverse i, scalar f)
                      .shift = (int8_t)(shift < INVERSE_SHIFT_MOST ? shift : INVERSE_SHIFT_MOST)};
 }
 
-scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
+scalar fixed_from_raw(int32_t raw, uint8_t fraction_bits)
 {
     return fraction_bits <= SCALAR_FRACTION
                ? fixed_saturate((int64_t)raw * ((int64_t)1 << (SCALAR_FRACTION - fraction_bits)))

@@ -175,6 +175,16 @@ static inline scalar narrow(wide sum)
     return FIXED_ROUNDED(sum, SCALAR_FRACTION, 30);
 }
 
+/* Of bits that are not known beforehand. */
+scalar fixed_from_raw(int32_t raw, uint8_t fraction_bits);
+
+static inline scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
+{
+    return __builtin_constant_p(fraction_bits) && fraction_bits <= SCALAR_FRACTION
+               ? fixed_saturate((int64_t)raw * ((int64_t)1 << (SCALAR_FRACTION - fraction_bits)))
+               : fixed_from_raw(raw, fraction_bits);
+}
+
 /* part / whole of two counts, part <= whole < 2^31. */
 scalar fraction(uint32_t part, uint32_t whole);
 

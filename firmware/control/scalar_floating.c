@@ -35,16 +35,20 @@ static inline scalar odd_polynomial(const scalar *coefficient, uint8_t terms, sc
 {
     const scalar y = mul(x, x);
     scalar p = coefficient[terms - 1];
+    UNROLL_SHORT_LOOP
     for (uint8_t k = (uint8_t)(terms - 1); k > 0; k--) {
         p = narrow(add_product(wide_of(coefficient[k - 1]), p, y));
     }
     return mul(p, x);
 }
 
-scalar sine_quarter(scalar x)
+/* |x| <= pi/2 */
+static inline scalar sine_quarter(scalar x)
 {
     return odd_polynomial(SINE, (uint8_t)(sizeof SINE / sizeof SINE[0]), x);
 }
+
+#include "control/scalar_sine.inc"
 
 scalar arctangent(scalar y, scalar x)
 {
@@ -76,11 +80,6 @@ static scalar power_of_two(int16_t exponent)
         value = value * SCALAR(0.5);
     }
     return value;
-}
-
-scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
-{
-    return (scalar)raw / (scalar)((uint32_t)1 << fraction_bits);
 }
 
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high)

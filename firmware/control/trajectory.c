@@ -10,7 +10,7 @@ bool trajectory_moving(const struct trajectory *trajectory)
     return trajectory->ticks != 0u;
 }
 
-bool trajectory_start(struct trajectory *trajectory, scalar target, uint32_t ticks, scalar dt_s)
+SELDOM bool trajectory_start(struct trajectory *trajectory, scalar target, uint32_t ticks, scalar dt_s)
 {
     if (trajectory_moving(trajectory) || ticks == 0u || ticks > INT32_MAX) {
         return false;
@@ -33,7 +33,7 @@ static bool braking(const struct trajectory *trajectory)
     return trajectory->brake_ticks != 0u;
 }
 
-void trajectory_brake(struct trajectory *trajectory, uint16_t brake_ticks, scalar dt_s)
+SELDOM void trajectory_brake(struct trajectory *trajectory, uint16_t brake_ticks, scalar dt_s)
 {
     if (!trajectory_moving(trajectory) || braking(trajectory) || brake_ticks == 0u) {
         return;

@@ -6,7 +6,7 @@ static inline uint8_t column(uint8_t j)
     return j > 0u ? (uint8_t)(j * (j - 1u) / 2u) : (uint8_t)0;
 }
 
-void ud_start(struct ud_factors *ud, uint8_t size, const variance prior[])
+SELDOM void ud_start(struct ud_factors *ud, uint8_t size, const variance prior[])
 {
     *ud = (struct ud_factors){.size = size};
     for (uint8_t k = 0; k < size; k++) {

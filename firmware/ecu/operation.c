@@ -80,6 +80,9 @@ static void enter(struct ecu *ecu, enum ecu_mode from, enum ecu_mode to)
 
 enum ecu_refusal operation_event(struct ecu *ecu, enum ecu_event event)
 {
+    if (event == EVENT_SENSORS_READY && ecu->mode != MODE_INIT) {
+        return REFUSAL_NONE; /* comes every tick, and one mode only waits for it: not worth the table's time */
+    }
     const struct mode_conditions conditions = conditions_of(ecu);
     const enum ecu_mode from = ecu->mode;
     enum ecu_mode to = from;

@@ -7,15 +7,33 @@
 
 enum parameter_kind { PARAMETER_SCALAR, PARAMETER_GAIN };
 
-struct parameter_entry {
-    size_t offset; /* in struct machine */
-    enum parameter_kind kind;
+struct parameter_quantity {
+    uint8_t kind;        /* enum parameter_kind */
     int8_t exponents[3]; /* twice that of pressure, twice that of area, that of the lever arm */
-    uint32_t low, high;  /* binary32, SI */
 };
+
+struct parameter_entry {
+    uint8_t field;     /* in struct machine */
+    uint8_t quantity;  /* in QUANTITIES */
+    uint8_t low, high; /* in LIMITS */
+};
+
+/* All of struct machine is numbers of one size: this many of them are before a field. */
+#define FIELD(name) ((uint8_t)(offsetof(struct machine, name) / sizeof(scalar)))
+_Static_assert(sizeof(scalar) == sizeof(gain), "fields are counted in numbers of one size");
+_Static_assert(sizeof(struct machine) / sizeof(scalar) <= UINT8_MAX, "a field's number is one byte");
 
 static const struct parameter_entry TABLE[PARAMETER_COUNT] = {
 #include "ecu/generated/parameter_table.inc"
+};
+
+static const struct parameter_quantity QUANTITIES[] = {
+#include "ecu/generated/parameter_quantities.inc"
+};
+
+/* binary32, SI */
+static const uint32_t LIMITS[] = {
+#include "ecu/generated/parameter_limits.inc"
 };
 
 const struct parameter_image default_parameter_image = {{
@@ -50,19 +68,18 @@ static bool bases_valid(const struct bases *bases)
            within(base_torque(bases), BASE_TORQUE_LOW, BASE_TORQUE_HIGH);
 }
 
-static int8_t base_of(const struct parameter_entry *entry, const struct bases *bases)
+static int8_t base_of(const struct parameter_quantity *quantity, const struct bases *bases)
 {
-    return (int8_t)(entry->exponents[0] * (bases->pressure / 2) + entry->exponents[1] * (bases->area / 2) +
-                    entry->exponents[2] * bases->lever);
+    return (int8_t)(quantity->exponents[0] * (bases->pressure / 2) +
+                    quantity->exponents[1] * (bases->area / 2) + quantity->exponents[2] * bases->lever);
 }
 
 /* Pairs of parameters of which the first must be below the second; for a prior's value equal will do. */
 struct parameter_relation {
-    size_t lower, higher;
+    uint8_t lower, higher; /* fields */
     bool may_be_equal;
 };
 
-#define FIELD(name) offsetof(struct machine, name)
 #define BELOW(a, b)               \
     {                             \
         FIELD(a), FIELD(b), false \
@@ -105,18 +122,18 @@ uint32_t parameters_get(const struct parameter_image *image, uint16_t entry)
 }
 
 /* The entry that fills a field; every field has one. */
-static uint16_t entry_of(size_t offset)
+static uint16_t entry_of(uint8_t field)
 {
     uint16_t k = 0;
-    while (k < PARAMETER_COUNT - 1 && TABLE[k].offset != offset) {
+    while (k < PARAMETER_COUNT - 1 && TABLE[k].field != field) {
         k++;
     }
     return k;
 }
 
-static scalar angle_of(const struct parameter_image *image, size_t offset)
+static scalar angle_of(const struct parameter_image *image, uint8_t field)
 {
-    return scalar_from_real32(parameters_get(image, entry_of(offset)), 0);
+    return scalar_from_real32(parameters_get(image, entry_of(field)), 0);
 }
 
 /* False, and *entry the offender, when two parameters contradict one another. */
@@ -131,7 +148,7 @@ static bool relations_hold(const struct parameter_image *image, uint16_t *entry)
             return false;
         }
     }
-    static const size_t ends[JOINTS][3] = {
+    static const uint8_t ends[JOINTS][3] = {
         {FIELD(cylinder[SWING].q0), FIELD(cylinder[SWING].q_min), FIELD(cylinder[SWING].q_max)},
         {FIELD(cylinder[WRIST].q0), FIELD(cylinder[WRIST].q_min), FIELD(cylinder[WRIST].q_max)},
     };
@@ -150,18 +167,19 @@ static bool relations_hold(const struct parameter_image *image, uint16_t *entry)
 static enum parameter_change number_fits(uint16_t entry, uint32_t bits, const struct bases *bases)
 {
     const struct parameter_entry *const row = &TABLE[entry];
+    const struct parameter_quantity *const quantity = &QUANTITIES[row->quantity];
     if (!real32_is_number(bits)) {
         return PARAMETER_NOT_HELD;
     }
-    if (real32_order(bits) < real32_order(row->low)) {
+    if (real32_order(bits) < real32_order(LIMITS[row->low])) {
         return PARAMETER_TOO_LOW;
     }
-    if (real32_order(bits) > real32_order(row->high)) {
+    if (real32_order(bits) > real32_order(LIMITS[row->high])) {
         return PARAMETER_TOO_HIGH;
     }
-    const int8_t exponent = base_of(row, bases);
-    const bool held =
-        row->kind == PARAMETER_GAIN ? gain_holds_real32(bits, exponent) : scalar_holds_real32(bits, exponent);
+    const int8_t exponent = base_of(quantity, bases);
+    const bool held = quantity->kind == (uint8_t)PARAMETER_GAIN ? gain_holds_real32(bits, exponent)
+                                                                : scalar_holds_real32(bits, exponent);
     return held ? PARAMETER_CHANGED : PARAMETER_NOT_HELD;
 }
 
@@ -207,9 +225,10 @@ enum ecu_status parameters_load(struct machine *machine, struct bases *bases,
     *bases = image_bases(image);
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
         const uint32_t bits = parameters_get(image, k);
-        const int8_t exponent = base_of(&TABLE[k], bases);
-        uint8_t *const field = (uint8_t *)machine + TABLE[k].offset;
-        if (TABLE[k].kind == PARAMETER_GAIN) {
+        const struct parameter_quantity *const quantity = &QUANTITIES[TABLE[k].quantity];
+        const int8_t exponent = base_of(quantity, bases);
+        uint8_t *const field = (uint8_t *)machine + TABLE[k].field * sizeof(scalar);
+        if (quantity->kind == (uint8_t)PARAMETER_GAIN) {
             *(gain *)(void *)field = gain_from_real32(bits, exponent);
         } else {
             *(scalar *)(void *)field = scalar_from_real32(bits, exponent);

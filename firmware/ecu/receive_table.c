@@ -3,6 +3,8 @@
 #include "can_protocol/generated/diarc.h"
 #include "ecu/e2e.h"
 
+#define CYCLIC_ROWS (1u << RX_ENCODERS | 1u << RX_PRESSURES_SWING | 1u << RX_PRESSURES_WRIST)
+
 const struct receive_row receive_table[RX_FRAMES] = {
     [RX_ENCODERS] = {DIARC_ENCODERS_FRAME_ID, DIARC_ENCODERS_LENGTH, true},
     [RX_PRESSURES_SWING] = {DIARC_PRESSURES_SWING_FRAME_ID, DIARC_PRESSURES_SWING_LENGTH, true},
@@ -49,6 +51,7 @@ enum receive_result receive_accept(struct receive *receive, const struct can_fra
     }
     state->heard = true;
     state->fresh = true;
+    receive->came |= (uint8_t)(1u << k);
     state->counter = e2e_counter(frame->data);
     for (uint8_t n = 0; n < 8u; n++) {
         state->data[n] = frame->data[n];
@@ -59,6 +62,7 @@ enum receive_result receive_accept(struct receive *receive, const struct can_fra
 void receive_begin_tick(struct receive *receive, uint8_t sync_counter)
 {
     receive->expected = (uint8_t)((sync_counter - 1u) % E2E_COUNTER_STATES);
+    receive->came = 0;
     for (uint8_t k = 0; k < RX_FRAMES; k++) {
         receive->row[k].fresh = false;
         receive->row[k].spoiled = false;
@@ -67,16 +71,14 @@ void receive_begin_tick(struct receive *receive, uint8_t sync_counter)
 
 bool receive_complete(const struct receive *receive)
 {
-    for (uint8_t k = 0; k < RX_FRAMES; k++) {
-        if (receive_table[k].cyclic && !receive->row[k].fresh) {
-            return false;
-        }
-    }
-    return true;
+    return (receive->came & CYCLIC_ROWS) == CYCLIC_ROWS;
 }
 
 void receive_end_tick(struct receive *receive)
 {
+    if (receive_complete(receive)) {
+        return;
+    }
     for (uint8_t k = 0; k < RX_FRAMES; k++) {
         const struct receive_state *const state = &receive->row[k];
         if (receive_table[k].cyclic && state->heard && !state->fresh && receive->lost < UINT16_MAX) {

@@ -31,6 +31,7 @@ struct receive_state {
 
 struct receive {
     struct receive_state row[RX_FRAMES];
+    uint8_t came;     /* one bit for each row that is fresh */
     uint8_t expected; /* counter of the frames that answer this tick's SYNC */
     uint16_t lost;    /* cyclic frames that did not come or were refused; stops at 65535 */
     uint8_t refused;  /* by length, CRC or counter; stops at 255 */

@@ -2,9 +2,10 @@
 
 void time_histogram_add(struct time_histogram *histogram, uint32_t time_us)
 {
-    uint8_t bucket = 0;
-    for (uint32_t rest = time_us; rest != 0u && bucket < TIME_BUCKETS - 1; rest >>= 1u) {
-        bucket++;
+    /* as many as the time has binary digits */
+    uint8_t bucket = time_us == 0u ? 0u : (uint8_t)(32 - __builtin_clz(time_us));
+    if (bucket >= TIME_BUCKETS) {
+        bucket = TIME_BUCKETS - 1;
     }
     if (histogram->count[bucket] < UINT32_MAX) {
         histogram->count[bucket]++;

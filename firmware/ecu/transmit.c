@@ -131,10 +131,51 @@ struct can_frame_11bit transmit_tracking(struct ecu *ecu)
     return frame;
 }
 
-#define ENCODE_THETA(member, SIGNAL, base)                                                        \
-    message.theta_##member =                                                                      \
-        WIRE_ENCODE(value, DIARC_PARAMETERS_THETA_##SIGNAL, (base), -WIRE_MAX_S24, WIRE_MAX_S24); \
-    message.sd_##member = (uint16_t)WIRE_ENCODE(sd, DIARC_PARAMETERS_SD_##SIGNAL, (base), 0, WIRE_MAX_U16)
+enum theta_base { BASE_TORQUE, BASE_COMPLIANCE, BASE_VOLUME };
+
+struct theta_scale {
+    scalar per_step, sd_per_step; /* mantissas */
+    int8_t exponent, sd_exponent;
+    uint8_t base; /* enum theta_base */
+};
+
+#define THETA_SCALE(SIGNAL, base)                                     \
+    {                                                                 \
+        SCALAR(DIARC_PARAMETERS_THETA_##SIGNAL##_PER_STEP_MANTISSA),  \
+            SCALAR(DIARC_PARAMETERS_SD_##SIGNAL##_PER_STEP_MANTISSA), \
+            DIARC_PARAMETERS_THETA_##SIGNAL##_PER_STEP_EXPONENT,      \
+            DIARC_PARAMETERS_SD_##SIGNAL##_PER_STEP_EXPONENT, (base)  \
+    }
+
+static const struct theta_scale THETA_SCALES[THETA_FRAMES] = {
+    [M_T] = THETA_SCALE(M_T, BASE_TORQUE),
+    [J] = THETA_SCALE(J, BASE_TORQUE),
+    [M2] = THETA_SCALE(M2, BASE_TORQUE),
+    [FV1] = THETA_SCALE(FV1, BASE_TORQUE),
+    [FV2] = THETA_SCALE(FV2, BASE_TORQUE),
+    [FC1] = THETA_SCALE(FC1, BASE_TORQUE),
+    [FC2] = THETA_SCALE(FC2, BASE_TORQUE),
+    [OM1] = THETA_SCALE(OM1_SWING, BASE_TORQUE),
+    [OM2] = THETA_SCALE(OM1_WRIST, BASE_TORQUE),
+    [THETA_M + BETA_INVERSE] = THETA_SCALE(BETA_INVERSE, BASE_COMPLIANCE),
+    [THETA_M + OM2_SWING] = THETA_SCALE(OM2_SWING, BASE_VOLUME),
+    [THETA_M + OM3_SWING] = THETA_SCALE(OM3_SWING, BASE_VOLUME),
+    [THETA_M + OM2_WRIST] = THETA_SCALE(OM2_WRIST, BASE_VOLUME),
+    [THETA_M + OM3_WRIST] = THETA_SCALE(OM3_WRIST, BASE_VOLUME),
+};
+
+static int8_t theta_base(const struct bases *bases, enum theta_base base)
+{
+    switch (base) {
+    case BASE_COMPLIANCE:
+        return (int8_t)(-bases->pressure);
+    case BASE_VOLUME:
+        return base_volume(bases);
+    case BASE_TORQUE:
+    default:
+        return base_torque(bases);
+    }
+}
 
 struct can_frame_11bit transmit_parameter(struct ecu *ecu)
 {
@@ -145,56 +186,47 @@ struct can_frame_11bit transmit_parameter(struct ecu *ecu)
     const bool mechanics = k < THETA_M;
     const uint8_t h = (uint8_t)(k - THETA_M);
     const scalar value = mechanics ? estimator->theta_m[k] : estimator->theta_h[h];
-    const scalar sd = mechanics ? estimator_sd_m(estimator, constants, (enum theta_m)k)
-                                : estimator_sd_h(estimator, constants, (enum theta_h)h);
-    const int8_t torque = base_torque(&ecu->bases);
-    const int8_t volume = base_volume(&ecu->bases);
-    const int8_t compliance = (int8_t)(-ecu->bases.pressure);
-    struct diarc_parameters_t message = {.mode = (uint8_t)ecu->mode, .parameter = k};
-    switch (k) {
-    case M_T:
-        ENCODE_THETA(m_t, M_T, torque);
-        break;
-    case J:
-        ENCODE_THETA(j, J, torque);
-        break;
-    case M2:
-        ENCODE_THETA(m2, M2, torque);
-        break;
-    case FV1:
-        ENCODE_THETA(fv1, FV1, torque);
-        break;
-    case FV2:
-        ENCODE_THETA(fv2, FV2, torque);
-        break;
-    case FC1:
-        ENCODE_THETA(fc1, FC1, torque);
-        break;
-    case FC2:
-        ENCODE_THETA(fc2, FC2, torque);
-        break;
-    case OM1:
-        ENCODE_THETA(om1_swing, OM1_SWING, torque);
-        break;
-    case OM2:
-        ENCODE_THETA(om1_wrist, OM1_WRIST, torque);
-        break;
-    case THETA_M + BETA_INVERSE:
-        ENCODE_THETA(beta_inverse, BETA_INVERSE, compliance);
-        break;
-    case THETA_M + OM2_SWING:
-        ENCODE_THETA(om2_swing, OM2_SWING, volume);
-        break;
-    case THETA_M + OM3_SWING:
-        ENCODE_THETA(om3_swing, OM3_SWING, volume);
-        break;
-    case THETA_M + OM2_WRIST:
-        ENCODE_THETA(om2_wrist, OM2_WRIST, volume);
-        break;
-    default:
-        ENCODE_THETA(om3_wrist, OM3_WRIST, volume);
-        break;
-    }
+    const scalar value_sd = mechanics ? estimator_sd_m(estimator, constants, (enum theta_m)k)
+                                      : estimator_sd_h(estimator, constants, (enum theta_h)h);
+    const struct theta_scale *const scale = &THETA_SCALES[k];
+    const int8_t base = theta_base(&ecu->bases, (enum theta_base)scale->base);
+    const int32_t theta =
+        wire_encode(value, scale->per_step, scale->exponent, base, -WIRE_MAX_S24, WIRE_MAX_S24);
+    const uint16_t sd =
+        (uint16_t)wire_encode(value_sd, scale->sd_per_step, scale->sd_exponent, base, 0, WIRE_MAX_U16);
+    /* one pair of these signals is in the frame: that of `parameter` */
+    const struct diarc_parameters_t message = {
+        .mode = (uint8_t)ecu->mode,
+        .parameter = k,
+        .theta_m_t = theta,
+        .sd_m_t = sd,
+        .theta_j = theta,
+        .sd_j = sd,
+        .theta_m2 = theta,
+        .sd_m2 = sd,
+        .theta_fv1 = theta,
+        .sd_fv1 = sd,
+        .theta_fv2 = theta,
+        .sd_fv2 = sd,
+        .theta_fc1 = theta,
+        .sd_fc1 = sd,
+        .theta_fc2 = theta,
+        .sd_fc2 = sd,
+        .theta_om1_swing = theta,
+        .sd_om1_swing = sd,
+        .theta_om1_wrist = theta,
+        .sd_om1_wrist = sd,
+        .theta_beta_inverse = theta,
+        .sd_beta_inverse = sd,
+        .theta_om2_swing = theta,
+        .sd_om2_swing = sd,
+        .theta_om3_swing = theta,
+        .sd_om3_swing = sd,
+        .theta_om2_wrist = theta,
+        .sd_om2_wrist = sd,
+        .theta_om3_wrist = theta,
+        .sd_om3_wrist = sd,
+    };
     struct can_frame_11bit frame = {.id = DIARC_PARAMETERS_FRAME_ID, .length = DIARC_PARAMETERS_LENGTH};
     (void)diarc_parameters_pack(frame.data, &message, sizeof frame.data);
     protect(ecu, TX_PARAMETERS, &frame);

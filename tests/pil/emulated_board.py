@@ -136,9 +136,9 @@ class EmulatedBoard:
     def figures(self) -> Figures:
         """Ask an image that counts (DIARC_COUNT_INSTRUCTIONS) for what it has counted."""
         with self.connect() as wire:
-            text = wire.ask("C\rM\r", r"MF[0-9A-F]{16}0{8}\r")
-        lines = re.findall(r"M([0-9])([0-9A-F]{8})([0-9A-F]{8})([0-9A-F]{8})\r", text)
-        last = re.search(r"MF([0-9A-F]{8})([0-9A-F]{8})", text)
+            text = wire.ask("C\rM\r", r"MFF[0-9A-F]{16}0{8}\r")
+        lines = re.findall(r"M0([0-9])([0-9A-F]{8})([0-9A-F]{8})([0-9A-F]{8})\r", text)
+        last = re.search(r"MFF([0-9A-F]{8})([0-9A-F]{8})", text)
         if len(lines) != len(STAGES) or last is None:
             raise BoardError(f"the image does not count: {text[-200:]!r}")
         instructions = {

@@ -149,7 +149,7 @@ def test_ecu_starts_when_the_channel_opens_and_anew_each_time(quiet_board: Emula
     """GIVEN an image WHEN its channel is opened, closed, and opened again THEN it is silent until opened, boots each
     time with SYNC counter 1, and says nothing after the answer to the close."""
     with quiet_board.connect() as wire:
-        assert wire.ask("V\rN\r", r"NDIAR\r") == "V1010\rNDIAR\r"
+        assert wire.ask("V\rN\r", r"ND1AC\r") == "V1010\rND1AC\r"
         for _ in range(2):
             assert wire.ask("O\r", SYNC).startswith("\rt701100\rt080101\r")
             wire.read_until(r"t080104\r")

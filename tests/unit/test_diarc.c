@@ -52,7 +52,7 @@ void setUp(void)
         .torque_uncertainty = per_unit(5, TORQUE),
         .H = per_unit(0.75, TORQUE),
         .beta_inverse = per_unit(1e-9, COMPLIANCE),
-        .beta_uncertainty = per_unit(1e-10, COMPLIANCE),
+        .beta_share = from_real(0.1),
         .flow_offset = per_unit(2e-6, FLOW),
         .flow_uncertainty = per_unit(4e-6, FLOW),
         .cylinder = {.R = per_unit(0.055, LEVER),

@@ -456,7 +456,7 @@ static void moving_row(const struct machine *machine, const struct estimator_con
         phi[k] = SCALAR(0);
     }
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-        phi[row_parameter[i][k]] = mul(row.phi[k], constants->scale_m[row_parameter[i][k]]);
+        phi[row_parameter(i, k)] = mul(row.phi[k], constants->scale_m[row_parameter(i, k)]);
     }
 }
 

@@ -10,15 +10,18 @@
 #define HALF_STEP BY_TYPE(0, 0, 0x1p-25) /* per unit; fixed point has no more digits */
 #define HALF_STEP_GAIN BY_TYPE(0, 0, 0x1p-19)
 
-/* The generated table, for its ranges. */
-enum parameter_kind { PARAMETER_SCALAR, PARAMETER_GAIN };
+/* The generated tables, for their ranges. */
+#define FIELD(name) offsetof(struct machine, name)
 static const struct {
     size_t offset;
-    enum parameter_kind kind;
-    int8_t exponents[3];
-    uint32_t low, high;
+    uint8_t quantity;
+    uint8_t low, high;
 } TABLE[PARAMETER_COUNT] = {
 #include "ecu/generated/parameter_table.inc"
+};
+
+static const uint32_t LIMITS[] = {
+#include "ecu/generated/parameter_limits.inc"
 };
 
 #define CRC_OFFSET (PARAMETER_IMAGE_BYTES - 4u)
@@ -259,8 +262,8 @@ static void test_number_outside_its_range_taken(void)
     /* GIVEN every parameter in turn, one step below its range and one above WHEN loaded THEN refused, the
      * entry reported, nothing touched */
     for (uint16_t k = 0; k < PARAMETER_COUNT; k++) {
-        expect_out_of_range(k, neighbour(TABLE[k].low, -INFINITY));
-        expect_out_of_range(k, neighbour(TABLE[k].high, INFINITY));
+        expect_out_of_range(k, neighbour(LIMITS[TABLE[k].low], -INFINITY));
+        expect_out_of_range(k, neighbour(LIMITS[TABLE[k].high], INFINITY));
     }
 }
 
@@ -282,7 +285,7 @@ static void test_number_too_large_for_the_type_clamped_in_silence(void)
     /* GIVEN a bound of 1e5 N m, 781 per unit with these bases WHEN loaded
      * THEN fixed point, which has room for 32, refuses it and names it; double and float take it */
     const uint16_t k = entry_named("control.wrist.gamma1_max_Nm");
-    set_parameter(k, TABLE[k].high);
+    set_parameter(k, LIMITS[TABLE[k].high]);
 #if defined(DIARC_SCALAR_FIXED)
     TEST_ASSERT_EQUAL_INT(ECU_PARAMETER_RANGE, parameters_load(&machine, &bases, &image, &entry));
     TEST_ASSERT_EQUAL_UINT16(k, entry);
@@ -300,11 +303,11 @@ static void test_number_at_the_edge_of_its_range_refused(void)
                                         "estimator.filter_time_s", "estimator.load_walk_kg"};
     for (unsigned n = 0; n < COUNT_OF(names); n++) {
         const uint16_t k = entry_named(names[n]);
-        set_parameter(k, TABLE[k].low);
+        set_parameter(k, LIMITS[TABLE[k].low]);
         TEST_ASSERT_EQUAL_INT_MESSAGE(ECU_OK, parameters_load(&machine, &bases, &image, &entry), names[n]);
-        set_parameter(k, TABLE[k].high);
+        set_parameter(k, LIMITS[TABLE[k].high]);
         TEST_ASSERT_EQUAL_INT_MESSAGE(ECU_OK, parameters_load(&machine, &bases, &image, &entry), names[n]);
-        if (TABLE[k].low == 0u) {
+        if (LIMITS[TABLE[k].low] == 0u) {
             set_parameter(k, 0x80000000u);
             TEST_ASSERT_EQUAL_INT_MESSAGE(ECU_OK, parameters_load(&machine, &bases, &image, &entry),
                                           names[n]);
@@ -317,8 +320,8 @@ static void expect_relation(const char *lower, const char *higher)
 {
     const uint16_t low = entry_named(lower);
     const uint16_t high = entry_named(higher);
-    const float most = fminf(number_of(TABLE[low].high), number_of(get_parameter(high)));
-    const float least = fmaxf(number_of(TABLE[high].low), number_of(get_parameter(low)));
+    const float most = fminf(number_of(LIMITS[TABLE[low].high]), number_of(get_parameter(high)));
+    const float least = fmaxf(number_of(LIMITS[TABLE[high].low]), number_of(get_parameter(low)));
     TEST_ASSERT_TRUE(most >= least);
     for (int swapped = 0; swapped < 2; swapped++) {
         set_parameter(low, bits_of(most));

@@ -7,11 +7,10 @@
 #include "ecu/ecu.h"
 #include "ports/cortex_m/clock.h"
 #include "ports/cortex_m/registers.h"
-#include "ports/cortex_m/slcan_text.h"
 #include "ports/cortex_m/uart.h"
 
 #define STACK_PATTERN 0xA5A5A5A5u
-#define LAST_LINE 0xFu
+#define LAST_LINE 0xFFu
 
 extern uint32_t image_stack_begin[], image_stack_end[];
 
@@ -98,17 +97,19 @@ void __wrap_controller_step(struct controller *controller, const struct machine 
 
 static void answer(uint32_t stage, uint32_t a, uint32_t b, uint32_t c)
 {
-    uint8_t *const line = uart_free_line();
+    struct uart_line *const line = uart_free_line();
     if (line == NULL) {
         return;
     }
-    line[0] = (uint8_t)'M';
-    slcan_write_hex(&line[1], stage, 1);
-    slcan_write_hex(&line[2], a, 8);
-    slcan_write_hex(&line[10], b, 8);
-    slcan_write_hex(&line[18], c, 8);
-    line[26] = (uint8_t)'\r';
-    uart_send(UART_LINE_BYTES);
+    const uint32_t numbers[] = {a, b, c};
+    line->first = (uint8_t)'M';
+    line->last = (uint8_t)'\r';
+    line->digits = 2u * UART_DIGIT_BYTES;
+    line->packed[0] = (uint8_t)stage;
+    for (uint8_t k = 0; k < UART_DIGIT_BYTES - 1u; k++) {
+        line->packed[1u + k] = (uint8_t)(numbers[k / 4u] >> (24u - 8u * (k % 4u)));
+    }
+    uart_send();
 }
 
 bool measure_command(uint8_t verb)

@@ -4,8 +4,8 @@
  * linker (--wrap), so that the code that is measured is the code that runs. The SLCAN command M answers for all ticks
  * since the start, of every mode, in hexadecimal:
  *
- *     M STAGE least mean most     a line for each stage: one digit and three times eight, without spaces
- *     MF ticks stack 0            the ticks counted, the bytes of stack used */
+ *     M STAGE least mean most     a line for each stage: two digits and three times eight, without spaces
+ *     MFF ticks stack 0            the ticks counted, the bytes of stack used */
 #ifndef PORTS_CORTEX_M_MEASURE_H
 #define PORTS_CORTEX_M_MEASURE_H
 

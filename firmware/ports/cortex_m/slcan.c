@@ -6,8 +6,10 @@
 #include "ports/cortex_m/slcan_text.h"
 #include "ports/cortex_m/uart.h"
 
-#define YES "\r"
-#define NO "\a"
+#define YES ((uint8_t)'\r')
+#define NO ((uint8_t)'\a')
+#define VERSION 0x1010u
+#define SERIAL_NUMBER 0xD1ACu
 #define LINES_A_CALL 64u /* who keeps sending must not hold up the tick */
 
 static struct {
@@ -15,18 +17,31 @@ static struct {
     uint32_t openings;
 } channel;
 
-static void answer(const char *text)
+static void answer(uint8_t yes_or_no)
 {
-    uint8_t *const line = uart_free_line();
+    struct uart_line *const line = uart_free_line();
     if (line == NULL) {
         return; /* who asks that much without reading gets no answer */
     }
-    uint8_t length = 0;
-    while (text[length] != '\0') {
-        line[length] = (uint8_t)text[length];
-        length++;
+    line->first = 0;
+    line->last = yes_or_no;
+    line->digits = 0;
+    uart_send();
+}
+
+/* The command's own letter and four digits. */
+static void answer_number(uint8_t verb, uint16_t number)
+{
+    struct uart_line *const line = uart_free_line();
+    if (line == NULL) {
+        return;
     }
-    uart_send(length);
+    line->first = verb;
+    line->last = YES;
+    line->digits = 4;
+    line->packed[0] = (uint8_t)(number >> 8);
+    line->packed[1] = (uint8_t)number;
+    uart_send();
 }
 
 static void open_channel(void)
@@ -54,9 +69,9 @@ static void command(const uint8_t *line, uint8_t length)
         channel.open = false;
         answer(YES);
     } else if (verb == (uint8_t)'V') {
-        answer("V1010\r");
+        answer_number(verb, VERSION);
     } else if (verb == (uint8_t)'N') {
-        answer("NDIAR\r");
+        answer_number(verb, SERIAL_NUMBER);
     } else if (length == 0u || (is_bit_rate(line, length) && !channel.open)) {
         answer(YES);
     } else if (!measure_command(verb)) {
@@ -102,10 +117,11 @@ enum port_status slcan_send(void *context, const struct can_frame_11bit *frame)
     const enum stage before = measure_switch(STAGE_SEND);
     enum port_status status = PORT_DOWN;
     if (channel.open) {
-        uint8_t *const line = uart_free_line();
+        struct uart_line *const line = uart_free_line();
         status = line != NULL ? PORT_OK : PORT_BUSY;
         if (line != NULL) {
-            uart_send(slcan_write_frame(frame, line));
+            slcan_write_frame(frame, line);
+            uart_send();
         }
     }
     (void)measure_switch(before);

@@ -3,35 +3,16 @@
 #define ID_DIGITS 3u
 #define HEAD 5u /* t, identifier, length */
 
-static uint8_t digit_of(uint32_t value)
+void slcan_write_frame(const struct can_frame_11bit *frame, struct uart_line *line)
 {
-    return (uint8_t) "0123456789ABCDEF"[value & 0xFu];
-}
-
-void slcan_write_hex(uint8_t *text, uint32_t value, uint8_t digits)
-{
-    for (uint8_t k = digits; k > 0u; k--) {
-        text[k - 1u] = digit_of(value);
-        value >>= 4;
+    line->first = (uint8_t)'t';
+    line->last = (uint8_t)'\r';
+    line->digits = (uint8_t)(ID_DIGITS + 1u + 2u * frame->length);
+    line->packed[0] = (uint8_t)(frame->id >> 4);
+    line->packed[1] = (uint8_t)(frame->id << 4 | frame->length);
+    for (uint8_t k = 0; k < sizeof frame->data; k++) {
+        line->packed[2u + k] = frame->data[k];
     }
-}
-
-uint8_t slcan_write_frame(const struct can_frame_11bit *frame, uint8_t text[SLCAN_FRAME_TEXT_MAX])
-{
-    text[0] = (uint8_t)'t';
-    text[1] = digit_of(frame->id >> 8);
-    text[2] = digit_of(frame->id >> 4);
-    text[3] = digit_of(frame->id);
-    text[4] = digit_of(frame->length);
-    uint8_t *end = &text[HEAD];
-    for (uint8_t k = 0; k < frame->length; k++) {
-        const uint32_t byte = frame->data[k];
-        end[0] = digit_of(byte >> 4);
-        end[1] = digit_of(byte);
-        end += 2;
-    }
-    *end = (uint8_t)'\r';
-    return (uint8_t)(HEAD + 2u * frame->length + 1u);
 }
 
 /* False when one of the characters is no digit. */

@@ -7,24 +7,25 @@
 
 #define RING_LINES 16u /* a power of two; a tick's frames are some 8 */
 
-struct line {
+struct text_line {
     uint8_t text[UART_LINE_BYTES];
     uint8_t length;
 };
 
-/* One side only writes `put`, the other only `taken`; both count on and wrap at 2^32. What a line holds is written
- * before `put` counts it and read before `taken` does. */
+/* Which lines of a ring are in use. One side only writes `put`, the other only `taken`; both count on and wrap at
+ * 2^32. What a line holds is written before `put` counts it and read before `taken` does. */
 struct ring {
-    struct line line[RING_LINES];
     volatile uint32_t put;
     volatile uint32_t taken;
 };
 
 static struct ring rx; /* put by the interrupt, taken by the main loop */
 static struct ring tx; /* put by the main loop, taken by the interrupt */
+static struct text_line rx_line[RING_LINES];
+static struct uart_line tx_line[RING_LINES];
 static volatile uint32_t rx_lines;
 static uint8_t rx_length; /* of the line that is coming in */
-static uint8_t tx_sent;   /* of the line that is going out */
+static uint8_t tx_place;  /* in the line that is going out: 0 its first character, then its digits */
 
 static uint32_t used(const struct ring *ring)
 {
@@ -32,14 +33,14 @@ static uint32_t used(const struct ring *ring)
     return put - ring->taken;
 }
 
-static struct line *oldest(struct ring *ring)
+static uint32_t oldest(const struct ring *ring)
 {
-    return &ring->line[ring->taken % RING_LINES];
+    return ring->taken % RING_LINES;
 }
 
-static struct line *next(struct ring *ring)
+static uint32_t next(const struct ring *ring)
 {
-    return &ring->line[ring->put % RING_LINES];
+    return ring->put % RING_LINES;
 }
 
 void uart_start(void)
@@ -53,7 +54,7 @@ void uart_start(void)
 static void end_line(void)
 {
     if (used(&rx) < RING_LINES) {
-        next(&rx)->length = rx_length;
+        rx_line[next(&rx)].length = rx_length;
         memory_barrier();
         rx.put = rx.put + 1u;
     }
@@ -71,7 +72,7 @@ void uart_rx_interrupt(void)
             end_line();
         } else if (rx_length < UART_LINE_BYTES) {
             if (used(&rx) < RING_LINES) {
-                next(&rx)->text[rx_length] = byte;
+                rx_line[next(&rx)].text[rx_length] = byte;
             }
             rx_length++;
         }
@@ -79,16 +80,29 @@ void uart_rx_interrupt(void)
     (void)measure_switch(before);
 }
 
+static uint8_t character(const struct uart_line *line, uint8_t place)
+{
+    if (place == 0u) {
+        return line->first;
+    }
+    if (place > line->digits) {
+        return line->last;
+    }
+    const uint8_t pair = line->packed[(place - 1u) / 2u];
+    return (uint8_t) "0123456789ABCDEF"[place % 2u != 0u ? pair >> 4 : pair & 0xFu];
+}
+
 void uart_tx_interrupt(void)
 {
     const enum stage before = measure_switch(STAGE_UART);
     UART_INTERRUPT = UART_INTERRUPT_TX;
     while (used(&tx) > 0u && (UART_STATE & UART_STATE_TX_FULL) == 0u) {
-        const struct line *const line = oldest(&tx);
-        UART_DATA = line->text[tx_sent];
-        tx_sent++;
-        if (tx_sent == line->length) {
-            tx_sent = 0;
+        const struct uart_line *const line = &tx_line[oldest(&tx)];
+        tx_place = tx_place == 0u && line->first == 0u ? 1u : tx_place;
+        UART_DATA = character(line, tx_place);
+        tx_place++;
+        if (tx_place > line->digits + 1u) {
+            tx_place = 0;
             memory_barrier();
             tx.taken = tx.taken + 1u;
         }
@@ -96,14 +110,13 @@ void uart_tx_interrupt(void)
     (void)measure_switch(before);
 }
 
-uint8_t *uart_free_line(void)
+struct uart_line *uart_free_line(void)
 {
-    return used(&tx) < RING_LINES ? next(&tx)->text : NULL;
+    return used(&tx) < RING_LINES ? &tx_line[next(&tx)] : NULL;
 }
 
-void uart_send(uint8_t length)
+void uart_send(void)
 {
-    next(&tx)->length = length;
     memory_barrier();
     tx.put = tx.put + 1u;
     NVIC_PENDING = 1u << UART_TX_VECTOR; /* the ring is emptied in one place only */
@@ -114,7 +127,7 @@ const uint8_t *uart_received_line(uint8_t *length)
     if (used(&rx) == 0u) {
         return NULL;
     }
-    const struct line *const line = oldest(&rx);
+    const struct text_line *const line = &rx_line[oldest(&rx)];
     memory_barrier();
     *length = line->length;
     return line->text;

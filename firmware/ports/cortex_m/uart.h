@@ -8,13 +8,24 @@
 /* 8 data bits, no parity, 1 Mbaud. */
 void uart_start(void);
 
-#define UART_LINE_BYTES 27u /* of a line, with its carriage return */
+#define UART_DIGIT_BYTES 13u
 
-/* Where the next line to send may be written, UART_LINE_BYTES at most; NULL when there is no room. */
-uint8_t *uart_free_line(void);
+/* A line to send: one character, hexadecimal digits, one character. The ring keeps the digits packed, and the
+ * interrupt makes text of them: half the memory, and nobody waits for a CAN frame to become text. */
+struct uart_line {
+    uint8_t first; /* 0: there is none */
+    uint8_t last;
+    uint8_t digits;                   /* 2 UART_DIGIT_BYTES at most */
+    uint8_t packed[UART_DIGIT_BYTES]; /* two digits each, the first one in the upper half */
+};
+
+/* Where the next line to send may be written; NULL when there is no room. */
+struct uart_line *uart_free_line(void);
 
 /* Sends what was written there. */
-void uart_send(uint8_t length);
+void uart_send(void);
+
+#define UART_LINE_BYTES 27u /* of a line received, with its carriage return */
 
 /* The oldest line received, without its carriage return, and its length: UART_LINE_BYTES for all that are too long. It
  * stays until uart_release. NULL when there is none. */
