@@ -21,6 +21,7 @@ from sil_plant.config import tomllib  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
 from sil_plant.protocol import DBC_PATH, database, dbc_hash  # noqa: E402
 from tools.object_files import object_files  # noqa: E402
+from tools.protocol_page import protocol_page  # noqa: E402
 
 NOTICE = "/* Made by tools/generate.py; do not edit. */\n"
 FRAMES_DIR = Path("can_protocol/generated")
@@ -252,7 +253,7 @@ def mode_page() -> dict[Path, str]:
 
 def generate() -> dict[Path, str]:
     """Every generated file, by its path in the repository."""
-    files = cantools_sources() | parameter_sources() | fault_sources() | mode_page() | object_files()
+    files = cantools_sources() | parameter_sources() | fault_sources() | mode_page() | object_files() | protocol_page()
     files[FRAMES_DIR / "diarc_hash.h"] = hash_header()
     files[FRAMES_DIR / "diarc_scales.h"] = scales_header()
     return files

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shutil
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -68,6 +69,90 @@ def test_faults_name_no_limit_that_is_no_parameter() -> None:
     assert limits
     for limit in limits:
         assert limit in names or limit.startswith("object "), limit
+
+
+# ---- docs/protocol.md ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def protocol_page(generated: dict[Path, str]) -> str:
+    return generated[Path("docs/protocol.md")]
+
+
+def section_of(page: str, frame: str) -> str:
+    """What the page says of one frame."""
+    return re.split(r"\n##+ ", page.split(f"\n### {frame}, ")[1])[0]
+
+
+def test_drawing_does_not_place_a_signal_where_no_other_tool_looks(protocol_page: str) -> None:
+    """GIVEN each signal of the DBC WHEN its bits alone are set by cantools
+    THEN they stand where the page has its letter, in the drawing of its page.
+    """
+    for message in protocol.database().messages:
+        section = section_of(protocol_page, message.name)
+        drawings = re.findall(r"^      ([a-z. ]+?)(?:   (\w+) ([\d to and]+))?$", section, re.MULTILINE)
+        for signal in message.signals:
+            row = re.search(rf"^\| (\w) \| {signal.name}(?: \(page (\d+)\))? \|", section, re.MULTILINE)
+            assert row, f"{message.name}.{signal.name} is not on the page"
+            page = int(row[2]) if row[2] else None
+            raw = dict.fromkeys((s.name for s in message.signals), 0)
+            raw[signal.name] = -1 if signal.is_signed else (1 << signal.length) - 1
+            if page is not None:
+                raw[next(s.name for s in message.signals if s.is_multiplexer)] = page
+            if signal.is_multiplexer:  # not every number is a page: from its place alone
+                data = (raw[signal.name] << signal.start).to_bytes(8, "little")
+            else:
+                data = message.encode(raw, scaling=False, strict=False)
+                cleared = message.encode(raw | {signal.name: 0}, scaling=False, strict=False)
+                data = bytes(a ^ b for a, b in zip(data, cleared, strict=True))
+            for drawn, _, span in drawings:
+                numbers = [int(n) for n in re.findall(r"\d+", span)]
+                there = page is None or page in numbers or (" to " in span and numbers[0] <= page <= numbers[1])
+                if there:
+                    bits = "".join("1" if c == row[1] else "0" for c in drawn.replace(" ", ""))
+                    assert int(bits, 2).to_bytes(message.length, "big") == data, f"{message.name}.{signal.name}"
+
+
+def test_crc_on_the_page_does_not_give_what_nobody_accepts(protocol_page: str, tmp_path: Path) -> None:
+    """GIVEN the C of the page, compiled WHEN given its golden vector and whole frames THEN byte 0 of each."""
+    compiler = shutil.which("cc")
+    assert compiler, "cc is not installed: sudo apt-get install gcc"
+    code = re.search(r"```c\n(.*?)```", protocol_page, re.DOTALL)
+    golden = re.search(r"identifier (\w+)h.*?\*\*((?:\w\w ?){8})\*\*", protocol_page, re.DOTALL)
+    assert code and golden
+    frames = re.findall(r"^\| \w+ \| (\w+)h \| `((?:\w\w ?){8})` \|", protocol_page, re.MULTILINE)
+    assert len(frames) >= 3
+    checks = ""
+    for can_id, data in [golden.groups(), *frames]:
+        octets = ", ".join(f"0x{byte}" for byte in data.split())
+        checks += f"    wrong += e2e_crc(0x{can_id}, (const uint8_t[8]){{{octets}}}) != 0x{data.split()[0]};\n"
+    source, program = tmp_path / "crc.c", tmp_path / "crc"
+    source.write_text(
+        f"#include <stdint.h>\n{code[1]}\nint main(void)\n{{\n    int wrong = 0;\n{checks}    return wrong;\n}}\n",
+        "utf-8",
+    )
+    command = [compiler, "-std=c11", "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program)]
+    assert subprocess.run(command, timeout=60, check=False).returncode == 0
+    assert subprocess.run([str(program)], timeout=10, check=False).returncode == 0
+
+
+def test_bus_load_on_the_page_is_not_another_than_the_plants(protocol_page: str) -> None:
+    """GIVEN the tick of 1 ms WHEN looked up THEN the load that run.py tells; at 0.5 ms it does not fit."""
+    assert f"| 1 ms | {100 * protocol.worst_case_bus_load():.0f} % |" in protocol_page
+    assert re.search(r"^\| 0\.5 ms \| 1\d\d %: does not fit \|$", protocol_page, re.MULTILINE)
+
+
+def test_links_of_the_page_lead_somewhere(protocol_page: str) -> None:
+    """GIVEN every link of the page WHEN followed THEN file and heading are there."""
+    links = re.findall(r"\]\(([^)\s]+)\)", protocol_page)
+    assert {"objects.md", "faults.md", "modes.md"} <= {link.split("#")[0] for link in links}
+    for link in links:
+        name, _, anchor = link.partition("#")
+        target = (ROOT / "docs" / name).resolve() if name else ROOT / "docs" / "protocol.md"
+        assert target.exists(), link
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^a-z0-9_ -]", "", h.lower()).replace(" ", "-") for h in headings}, link
 
 
 def test_check_does_not_pass_a_stale_or_missing_file(

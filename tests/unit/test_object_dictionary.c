@@ -484,6 +484,57 @@ static unsigned heartbeats_in(unsigned count)
     return heard;
 }
 
+/* ---- what the SDO server never asks ---- */
+
+static void test_text_or_image_read_as_a_number(void)
+{
+    /* GIVEN an object that is no number WHEN its number is asked for all the same THEN it is 0, not what was there */
+    static const uint16_t none[] = {0x1008, 0x2000};
+    for (unsigned k = 0; k < COUNT_OF(none); k++) {
+        struct object object;
+        uint32_t value = 0xA5A5A5A5u;
+        TEST_ASSERT_EQUAL_HEX32(OBJECT_DONE, object_find(none[k], 0, &object));
+        TEST_ASSERT_FALSE(object_is_number(&object));
+        TEST_ASSERT_EQUAL_HEX32(OBJECT_DONE, object_read(&ecu, &the_port, &object, &value));
+        TEST_ASSERT_EQUAL_HEX32(0, value);
+    }
+}
+
+static void test_image_written_as_a_number(void)
+{
+    /* GIVEN the image, all or nothing by segments WHEN written as a number THEN refused, and nothing has changed */
+    static struct ecu before;
+    struct object object;
+    to_standby();
+    TEST_ASSERT_EQUAL_HEX32(OBJECT_DONE, object_find(0x2000, 0, &object));
+    TEST_ASSERT_EQUAL_HEX32(OBJECT_DONE, object_may_write(&ecu, &object));
+    memcpy(&before, &ecu, sizeof ecu);
+    TEST_ASSERT_EQUAL_HEX32(ABORT_READ_ONLY, object_write(&ecu, &the_port, &object, 0));
+    TEST_ASSERT_EQUAL_HEX32(ABORT_RANGE, object_write(&ecu, &the_port, &object, 1));
+    TEST_ASSERT_EQUAL_MEMORY(&before, &ecu, sizeof ecu);
+}
+
+static void test_write_begun_in_standby_ends_in_run(void)
+{
+    /* GIVEN a parameter written in segments WHEN the arm starts between request and segment THEN refused then, and
+     * the parameter is as it was; and so is an object that is read only, whoever asks */
+    struct object object;
+    to_standby();
+    const uint16_t index = FIRST("control.wrist.k1_1_s");
+    const uint32_t before = number(index, 0);
+    TEST_ASSERT_EQUAL_HEX8(0x60, ask_for(0x21, index, 0, 4)[0]);
+    queue_request(2, CONTROLLER_DIARC);
+    tick();
+    TEST_ASSERT_EQUAL_INT(MODE_RUN, ecu.mode);
+    const uint8_t segment[8] = {0x07, 0, 0, 0x80, 0x3F};
+    const uint8_t *const answer = ask(segment);
+    TEST_ASSERT_NOT_NULL(answer);
+    TEST_ASSERT_EQUAL_HEX32(ABORT_STATE, abort_of(answer, index, 0));
+    TEST_ASSERT_EQUAL_HEX32(before, number(index, 0));
+    TEST_ASSERT_EQUAL_HEX32(OBJECT_DONE, object_find(0x2001, 0, &object));
+    TEST_ASSERT_EQUAL_HEX32(ABORT_READ_ONLY, object_write(&ecu, &the_port, &object, 0));
+}
+
 static void test_heartbeat_time_ignored(void)
 {
     /* GIVEN a heartbeat every 100 ms WHEN 1017h is written THEN it comes at that time, at once when that is shorter,
@@ -588,6 +639,9 @@ int main(void)
     RUN_TEST(test_saved_set_is_not_the_one_in_force);
     RUN_TEST(test_save_that_failed_reported_done);
     RUN_TEST(test_error_history_in_another_order);
+    RUN_TEST(test_text_or_image_read_as_a_number);
+    RUN_TEST(test_image_written_as_a_number);
+    RUN_TEST(test_write_begun_in_standby_ends_in_run);
     RUN_TEST(test_heartbeat_time_ignored);
     RUN_TEST(test_watched_node_out_of_range_taken);
     RUN_TEST(test_silence_of_the_node_before_blamed_on_the_next);

@@ -128,6 +128,17 @@ static void test_rehearsal_is_not_taken_for_a_tick(void)
     TEST_ASSERT_FALSE(understudy.armed);
 }
 
+static void test_rehearsal_without_samples_makes_some_up(void)
+{
+    /* GIVEN an ECU that has heard no sensor yet WHEN the law is rehearsed THEN not a byte of the copy is written */
+    static struct controller before, understudy;
+    memset(&before, 0xA5, sizeof before);
+    memset(&understudy, 0xA5, sizeof understudy);
+    TEST_ASSERT_FALSE(ecu.sampled);
+    ecu_rehearse(&ecu, &understudy);
+    TEST_ASSERT_EQUAL_MEMORY(&before, &understudy, sizeof understudy);
+}
+
 static void test_stop_in_standby_waits_for_nothing(void)
 {
     /* GIVEN an ECU whose valves are shut WHEN a safe stop is asked for THEN the port may end at once */
@@ -144,6 +155,7 @@ int main(void)
     RUN_TEST(test_bucket_left_out_on_the_timing_frame);
     RUN_TEST(test_missed_periods_not_counted_as_late);
     RUN_TEST(test_rehearsal_is_not_taken_for_a_tick);
+    RUN_TEST(test_rehearsal_without_samples_makes_some_up);
     RUN_TEST(test_stop_in_standby_waits_for_nothing);
     return UNITY_END();
 }

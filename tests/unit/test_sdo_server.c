@@ -247,6 +247,53 @@ static void test_more_segments_than_an_image_written_past_it(void)
     expect_set(&default_parameter_image);
 }
 
+static void test_image_longer_than_its_room_written_past_it(void)
+{
+    /* GIVEN an image but for its last byte WHEN more comes than is left THEN none of it is written, and what follows
+     * the image in the ECU keeps its bytes */
+    static struct ecu before;
+    to_standby();
+    const struct parameter_image old = ecu.image;
+    parameter_set_begin(&ecu);
+    for (uint16_t k = 0; k + 1u < PARAMETER_IMAGE_BYTES; k++) {
+        TEST_ASSERT_TRUE(parameter_set_add(&ecu, &old.bytes[k], 1));
+    }
+    memcpy(&before, &ecu, sizeof ecu);
+    const uint8_t two[2] = {0x5A, 0x5A};
+    TEST_ASSERT_FALSE(parameter_set_add(&ecu, two, 2));
+    TEST_ASSERT_EQUAL_MEMORY(&before, &ecu, sizeof ecu);
+}
+
+static void test_image_without_its_end_put_into_use(void)
+{
+    /* GIVEN an image of which the last byte is missing WHEN taken THEN it is none, the machine is that of the set in
+     * force again, and the next image is taken */
+    uint16_t entry = 7;
+    to_standby();
+    const struct parameter_image old = ecu.image;
+    const struct machine machine = ecu.machine;
+    parameter_set_begin(&ecu);
+    for (uint16_t k = 0; k + 1u < PARAMETER_IMAGE_BYTES; k++) {
+        TEST_ASSERT_TRUE(parameter_set_add(&ecu, &old.bytes[k], 1));
+    }
+    TEST_ASSERT_EQUAL_INT(ECU_IMAGE_NOT_ONE, parameter_set_take(&ecu, &entry));
+    TEST_ASSERT_EQUAL_UINT16(0, entry);
+    TEST_ASSERT_FALSE(parameter_set_coming(&ecu));
+    TEST_ASSERT_EQUAL_MEMORY(&old, &ecu.image, sizeof old);
+    TEST_ASSERT_EQUAL_MEMORY(&machine, &ecu.machine, sizeof machine);
+    TEST_ASSERT_EQUAL_HEX32(0, write_segments(0x2000, 0, old.bytes, PARAMETER_IMAGE_BYTES, UINT32_MAX));
+}
+
+static void test_transfer_that_lost_its_object_sends_other_bytes(void)
+{
+    /* GIVEN a text that is being read WHEN the ECU no longer knows of what THEN abort, instead of bytes of something */
+    TEST_ASSERT_EQUAL_HEX8(0x41, ask_for(0x40, 0x1008, 0, 0)[0]);
+    ecu.sdo.index = 0x1009 + 0x4000; /* there is none: as after a bit that has flipped */
+    const uint8_t *const answer = ask_for(0x60, 0, 0, 0);
+    TEST_ASSERT_EQUAL_HEX32(ABORT_NO_OBJECT, abort_of(answer, 0x5009, 0));
+    TEST_ASSERT_EQUAL_INT(SDO_IDLE, ecu.sdo.transfer);
+}
+
 static void test_number_in_segments_not_understood(void)
 {
     /* GIVEN a number that comes in segments, and one expedited of untold size WHEN written THEN both are taken */
@@ -417,6 +464,9 @@ int main(void)
     RUN_TEST(test_download_begun_while_the_valves_are_driven);
     RUN_TEST(test_length_of_a_write_not_looked_at);
     RUN_TEST(test_more_segments_than_an_image_written_past_it);
+    RUN_TEST(test_image_longer_than_its_room_written_past_it);
+    RUN_TEST(test_image_without_its_end_put_into_use);
+    RUN_TEST(test_transfer_that_lost_its_object_sends_other_bytes);
     RUN_TEST(test_number_in_segments_not_understood);
     RUN_TEST(test_transfer_waits_for_ever);
     RUN_TEST(test_abort_of_the_client_answered);

@@ -19,6 +19,7 @@ static struct flash {
     bool read_fails[STORE_SLOTS];
     uint32_t reads; /* since new, and the one that fails */
     uint32_t read_that_fails;
+    uint32_t read_that_lies; /* one bit of it is wrong */
     bool erase_fails;
 } flash;
 
@@ -46,6 +47,7 @@ static bool flash_read(void *context, uint8_t slot, uint32_t offset, uint8_t *by
     f->reads++;
     TEST_ASSERT_LESS_OR_EQUAL_UINT32(STORE_SLOT_BYTES, offset + length);
     memcpy(bytes, &f->bytes[slot][offset], length);
+    bytes[length / 2u] ^= f->reads == f->read_that_lies ? 0x04u : 0u;
     return powered() && !f->read_fails[slot] && f->reads != f->read_that_fails;
 }
 
@@ -437,6 +439,53 @@ static void test_save_that_failed_counts_all_the_same(void)
     TEST_ASSERT_GREATER_OR_EQUAL_UINT32(STORE_BODY_BYTES / 32u + 2u, failed);
 }
 
+static void test_set_that_reads_otherwise_the_second_time_is_used(void)
+{
+    /* GIVEN two sets WHEN any one read of a load fails, or one bit of it is wrong THEN never an image that is none of
+     * the two, and never the older one in silence: it is the newest, or the load says what happened */
+    for (uint8_t lies = 0; lies < 2u; lies++) {
+        uint32_t failed = 0;
+        bool reached = true;
+        save(0);
+        save(1);
+        for (uint32_t n = 1; reached; n++) {
+            flash.reads = 0;
+            flash.read_that_fails = lies == 0u ? n : 0u;
+            flash.read_that_lies = lies == 0u ? 0u : n;
+            const enum store_status said = load();
+            reached = flash.reads >= n;
+            failed += said == STORE_FAILED ? 1u : 0u;
+            if (said == STORE_OLDER) {
+                TEST_ASSERT_TRUE(is_loaded(&set[0]) || is_loaded(&set[1])); /* the slot that was doubtful */
+            } else if (said != STORE_FAILED) {
+                TEST_ASSERT_EQUAL_INT(STORE_OK, said);
+                TEST_ASSERT_TRUE(is_loaded(&set[1]));
+            }
+        }
+        TEST_ASSERT_EQUAL_UINT32((PARAMETER_IMAGE_BYTES + 31u) / 32u, failed); /* each chunk's second read */
+        new_flash();
+    }
+}
+
+static void test_damage_that_cannot_be_erased_kept_beside_a_new_set(void)
+{
+    /* GIVEN both sets damaged and a memory that does not erase any more WHEN saved THEN failed and nothing promised:
+     * with the slot left as it is, the new set would be reported as the older one for ever */
+    save(0);
+    save(1);
+    flash.bytes[0][30] ^= 0x01u;
+    flash.bytes[1][30] ^= 0x01u;
+    const struct flash before = flash;
+    flash.erase_fails = true;
+    flash.stuck_at = 0; /* nor is the header gone by chance */
+    TEST_ASSERT_EQUAL_INT(STORE_FAILED, store_save(&PORT, &set[2]));
+    TEST_ASSERT_EQUAL_MEMORY(before.bytes[0], flash.bytes[0], STORE_SLOT_BYTES); /* not begun */
+    flash.erase_fails = false;
+    flash.stuck_at = NEVER;
+    save(2);
+    expect(STORE_OK, 2);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -456,5 +505,7 @@ int main(void)
     RUN_TEST(test_worn_out_byte_not_noticed);
     RUN_TEST(test_memory_that_fails_not_told);
     RUN_TEST(test_save_that_failed_counts_all_the_same);
+    RUN_TEST(test_set_that_reads_otherwise_the_second_time_is_used);
+    RUN_TEST(test_damage_that_cannot_be_erased_kept_beside_a_new_set);
     return UNITY_END();
 }
