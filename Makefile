@@ -28,6 +28,12 @@ images: ## the Cortex-M images, build/cortex-m4f/diarc_ecu.elf and build/cortex-
 	    cmake --preset $$preset && cmake --build --preset $$preset --parallel $(JOBS) && \
 	    arm-none-eabi-size build/$$preset/diarc_ecu.elf || exit 1; done
 
+fmu: ## build/diarc_ecu.fmu and build/diarc_plant.fmu: the ECU and the arm for other simulation tools
+	@tools/setup.sh demo
+	@cmake -S . -B build -DDIARC_PYTHON=$(abspath $(PYTHON))
+	@cmake --build build --target fmu --parallel $(JOBS)
+	@$(PYTHON) tools/export_fmu.py plant -o build/diarc_plant.fmu
+
 budget: ## flash, RAM, worst-case stack and instructions a tick of both images, beside their goals
 	@tools/setup.sh test
 	@$(MAKE) firmware

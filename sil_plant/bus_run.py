@@ -11,7 +11,7 @@ import numpy as np
 
 from sil_plant import injection, protocol
 from sil_plant.buses import FramePort
-from sil_plant.external_plant import ExternalPlant
+from sil_plant.external_plant import ExternalPlant, PlantLostError
 from sil_plant.frames import FRAME_BYTES, from_row, to_row
 from sil_plant.io_node import advance_one_period
 from sil_plant.session import (
@@ -218,7 +218,8 @@ def close_valves(session: Session, plant: ExternalPlant | None = None) -> None:
     """What the node does without SYNC: it goes on by its own clock until its valves are closed."""
     for _ in range(session.timing.timeout_ticks + 2):
         if plant is not None:
-            plant.advance_one_period(session, 0.0)
+            with contextlib.suppress(PlantLostError):  # a plant that is gone has no valves to close
+                plant.advance_one_period(session, 0.0)
         else:
             advance_one_period(session.node, session.plant, session.timing, session.errors, 0.0)
 
