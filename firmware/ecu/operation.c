@@ -29,6 +29,14 @@ static void arm(struct ecu *ecu, bool commissioning)
     supervision_arm(ecu, &measured);
 }
 
+/* From here on an angle is not held against the one before: what is wrong with a sensor must not get into an estimate
+ * that the next run begins with, so its filters, still open from the motion, are emptied. */
+static void disarm(struct ecu *ecu)
+{
+    controller_disarm(&ecu->controller);
+    controller_gap(&ecu->controller);
+}
+
 static void brake(struct ecu *ecu)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
@@ -41,7 +49,7 @@ static void start_safe_stop(struct ecu *ecu)
     const struct measurement measured = samples_measured(ecu, &ecu->samples);
     ecu->stop = safe_stop_start(&ecu->controller, &ecu->machine, &ecu->constants, &measured,
                                 ecu->supervision.stop_ticks);
-    controller_disarm(&ecu->controller);
+    disarm(ecu);
 }
 
 static void enter(struct ecu *ecu, enum ecu_mode from, enum ecu_mode to)
@@ -73,7 +81,7 @@ static void enter(struct ecu *ecu, enum ecu_mode from, enum ecu_mode to)
     case MODE_STANDBY:
     case MODE_FAULT:
     default:
-        controller_disarm(&ecu->controller);
+        disarm(ecu);
         break;
     }
 }

@@ -64,7 +64,10 @@ static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t
     const uint32_t ticks = kept ? 1u + ecu->supervision.sensors_wrong : 1u;
     const int32_t steps = (int32_t)((ticks * ecu->period_us + US_PER_STEP - 1u) / US_PER_STEP);
     const scalar step = absolute(pressure_of(ecu, (raw - before) / steps));
-    return ecu->controller.armed && step > limits->pressure_step ? FAULT_SENSOR_RATE : FAULT_NONE;
+    /* as of an angle, a sensor that was refused has to come closer */
+    const bool doubted = !kept && ecu->supervision.sensors_wrong > 0u;
+    const scalar most = doubted ? mul(SCALAR(0.25), limits->pressure_step) : limits->pressure_step;
+    return ecu->controller.armed && step > most ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
 static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *samples)

@@ -503,6 +503,32 @@ static void test_angle_just_too_fast_used(void)
     }
 }
 
+static void test_angle_that_stopped_the_arm_moves_the_estimate(void)
+{
+    /* GIVEN a move with true sensors, and an estimate that follows WHEN an encoder jumps by 0.5 rad and stays there, which
+     * stops the arm THEN not a bit of the estimate moves from the stop on, nor when the angle comes back */
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        setUp();
+        to_run(CONTROLLER_DIARC);
+        sensors.follow = true;
+        queue_request(REQUEST_MOVE, i, 0, 0.5, 800);
+        ticks(600);
+        TEST_ASSERT_TRUE(ecu.controller.estimator.updating);
+        sensors.follow = false;
+        const int32_t before = sensors.angle[i];
+        sensors.angle[i] = before - angle_raw(0.5);
+        ticks(WRONG_TICKS + 1);
+        TEST_ASSERT_EQUAL_HEX32(1u << FAULT_SENSOR_RATE, ecu.active_faults);
+        const struct estimator held = ecu.controller.estimator;
+        for (int k = 0; k < 2 * STOP_TICKS; k++) {
+            sensors.angle[i] = k < STOP_TICKS + 20 ? sensors.angle[i] : before;
+            tick();
+            TEST_ASSERT_EQUAL_MEMORY(held.theta_m, ecu.controller.estimator.theta_m, sizeof held.theta_m);
+            TEST_ASSERT_EQUAL_MEMORY(held.theta_h, ecu.controller.estimator.theta_h, sizeof held.theta_h);
+        }
+    }
+}
+
 static void test_noise_that_is_refused_sneaks_in(void)
 {
     /* GIVEN RUN at rest WHEN the encoder jumps, refused, and then says a half of what it might move in a tick THEN that is
@@ -555,7 +581,7 @@ static void test_pressure_that_jumps_used(void)
 static void test_pressure_after_lost_frames_taken_for_a_jump(void)
 {
     /* GIVEN RUN WHEN three ticks' frames are lost and the pressure has changed meanwhile by less than four steps THEN it
-     * is taken; by more THEN it is wrong. After values that were refused it has only one step */
+     * is taken; by more THEN it is wrong. After values that were refused it has only a quarter of a step */
     const int32_t step = (int32_t)lround(limit_of("pressure_step_Pa") / 500);
     for (int much = 0; much < 2; much++) {
         setUp();
@@ -571,9 +597,16 @@ static void test_pressure_after_lost_frames_taken_for_a_jump(void)
     }
     setUp();
     to_run(CONTROLLER_PID);
-    sensors.pressure[SWING][BORE] = (uint16_t)(sensors.pressure[SWING][BORE] + step + 8);
+    const uint16_t before = sensors.pressure[SWING][BORE];
+    sensors.pressure[SWING][BORE] = (uint16_t)(before + step + 8);
     ticks(3);
     TEST_ASSERT_EQUAL_UINT8(3, ecu.supervision.sensors_wrong);
+    sensors.pressure[SWING][BORE] = (uint16_t)(before + step / 4 + 8);
+    tick();
+    TEST_ASSERT_EQUAL_UINT8(4, ecu.supervision.sensors_wrong);
+    sensors.pressure[SWING][BORE] = (uint16_t)(before + step / 4 - 8);
+    tick();
+    TEST_ASSERT_EQUAL_UINT8(0, ecu.supervision.sensors_wrong);
 }
 
 static void test_single_spike_reaches_the_law(void)
@@ -1430,6 +1463,7 @@ int main(void)
     RUN_TEST(test_angle_where_no_arm_can_be_used);
     RUN_TEST(test_angle_faster_than_any_arm_used);
     RUN_TEST(test_angle_just_too_fast_used);
+    RUN_TEST(test_angle_that_stopped_the_arm_moves_the_estimate);
     RUN_TEST(test_noise_that_is_refused_sneaks_in);
     RUN_TEST(test_pressure_that_jumps_used);
     RUN_TEST(test_pressure_after_lost_frames_taken_for_a_jump);
