@@ -559,13 +559,16 @@ def document_part(measured: dict[str, Measured]) -> str:
             "  pushes and the deepest interrupt. Frames are the compiler's (`-fcallgraph-info=su`), those of libgcc\n"
             "  are read from the machine code. Calls through pointers are the port's three, resolved from what the\n"
             "  image has in `the_port`. Recursion, a frame that is not constant, or any other pointer is an error.\n"
-            "- **Instructions** are of every tick from the opening of the channel on: INIT, STANDBY, TARE, RUN.\n"
+            "- **Instructions** are of every tick from the opening of the channel on, in every mode.\n"
             f"  Counted in QEMU over {runs}\n"
             f"  ({loads}); the mean is of the first run, the maximum of all ticks of all.\n"
+            f"  `{MODES}` (`tools/budget_modes.py`) is moves broken off by HOLD and by SAFE_STOP, COMMISSION, a\n"
+            "  fault and its reset, and leaving operational with the valves open, while a master reads by SDO.\n"
             "  The figure compared is a tick's frames, estimate, control and send together: a run gives the\n"
             "  same counts, to a few, unless a byte comes in between: its interrupt's entry is counted too, so the\n"
             "  least of repeated measurements is taken. What measuring itself takes is taken off.\n"
-            "  Receiving depends on how the UART's bytes arrive and is not in the figure.",
+            "  Receiving depends on how the UART's bytes arrive and is not in the figure; its maximum is the\n"
+            "  longest wait for sensors that do not answer, 250 ms, in which each period wakes the main loop once.",
             "Instructions a tick, by stage:",
             markdown(["", *presets], stage_rows(measured)),
             "`receive`, `send` and `UART` are mostly SLCAN text. `estimate` is `estimator_step`, `control` the\n"
