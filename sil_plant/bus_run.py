@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
 
 from sil_plant import injection, protocol
-from sil_plant.buses import FramePort
+from sil_plant.buses import BusError, FramePort
 from sil_plant.external_plant import ExternalPlant, PlantLostError
 from sil_plant.frames import FRAME_BYTES, from_row, to_row
 from sil_plant.io_node import advance_one_period
 from sil_plant.session import (
     DBC_HASH,
     HASH_HEARD,
+    NMT_ENTER_PRE_OPERATIONAL,
     NMT_RESET,
     NMT_STOP,
     OUT_ROWS,
@@ -222,6 +224,30 @@ def close_valves(session: Session, plant: ExternalPlant | None = None) -> None:
                 plant.advance_one_period(session, 0.0)
         else:
             advance_one_period(session.node, session.plant, session.timing, session.errors, 0.0)
+
+
+def park_ecu(port: FramePort) -> None:
+    """Have the ECU of a run that is over shut the valves and answer SDO; it hears no sensors any more."""
+    port.send(*from_row(nmt_frame(NMT_ENTER_PRE_OPERATIONAL)))
+
+
+@contextlib.contextmanager
+def served(port: FramePort) -> Iterator[None]:
+    """Take what comes on the bus, so that a hub in this process goes on for its clients, while the context lasts."""
+    over = threading.Event()
+
+    def serve() -> None:
+        with contextlib.suppress(BusError):  # who uses the bus meanwhile is told by its own port
+            while not over.is_set():
+                port.receive(0.02)
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def leave_ecu_safe(port: FramePort) -> None:

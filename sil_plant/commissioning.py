@@ -1,7 +1,8 @@
 """Commission, then operate: the same estimator with two priors.
 
-Commissioning moves the arm without load. The load is pinned to zero and everything else is wide open; what comes
-out, and how well the move showed it, becomes the prior that operation holds tightly while the load is wide open.
+Commissioning moves the arm without load, in the ECU's mode COMMISSION: the load is pinned to zero and everything else
+is wide open. What comes out, and how well the move showed it, becomes the prior that operation holds tightly while the
+load is wide open.
 """
 
 from __future__ import annotations
@@ -12,18 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from sil_plant.config import ConfigError, TomlFile, flatten
-from sil_plant.machine import Machine, with_changes
+from sil_plant.ecu_parameters import EcuParameters, RefusedError, image_values
+from sil_plant.machine import Machine, parameter_image, with_changes
 from sil_plant.scenario import SCENARIOS
 from sil_plant.session import THETA, Monitor
 
 COMMISSION_SCENARIO = SCENARIOS / "commission.toml"
-# Prior of commissioning: this share of a parameter's range.
+# The prior in COMMISSION is this share of a parameter's range: WIDE_SD of firmware/control/estimator.c.
 WIDE_SHARE = 0.25
 # Below this ratio of prior to posterior standard deviation a move has shown nothing of a parameter.
 EXCITATION_LEAST = 3.0
 # The standard deviation that is left may be this much of what operation assumes, at most.
 SD_MOST = 2.0
-NO_INNOVATION_TEST_SD = 20.0
 
 UNITS = {
     "m_t": "kg",
@@ -75,18 +76,6 @@ class Finding:
     def advice(self) -> str:
         """What to move to see this parameter."""
         return ADVICE[PARAMETER_JOINT.get(self.name, "wrist")]
-
-
-def commissioning_machine(machine: Machine) -> Machine:
-    """The machine with the priors of commissioning: load pinned to zero, all else wide open."""
-    changes = {
-        "estimator.innovation_limit_sd": NO_INNOVATION_TEST_SD,
-        "estimator.prior.m_t_kg.value": 0.0,
-        "estimator.prior.m_t_kg.sd": 0.0,
-    }
-    for _, prior in THETA[1:]:
-        changes[f"estimator.prior.{prior}.sd"] = _wide_sd(machine, prior)
-    return with_changes(machine, changes, "commissioning")
 
 
 def plant_when_commissioned(plant_machine: Machine) -> Machine:
@@ -165,6 +154,26 @@ def check_excitation(found: list[Finding]) -> None:
     )
     advice = "; ".join(dict.fromkeys(f.advice for f in poor))
     raise ConfigError(f"the move excites too little to know {names}: {advice}. Nothing was stored")
+
+
+def save_in_ecu(ecu: EcuParameters, machine: Machine, found: list[Finding]) -> None:
+    """Put what was found into the ECU that found it, and have it kept over power-off.
+
+    Raises
+    ------
+    RefusedError
+        When it is another machine's ECU, or it refuses; then it has the set of before.
+    """
+    ours, theirs = image_values(parameter_image(machine)), image_values(ecu.image())
+    found_keys = {f"estimator.prior.{f.prior}.value" for f in found}
+    for name, value in ours.items():
+        if name not in found_keys and theirs[name] != value:
+            raise RefusedError(
+                f"the ECU is set up for another machine than {machine.path} ({name} is {theirs[name]:.9g}, there "
+                f"{value:.9g}), so nothing was saved in it; give it this one (params.py load FILE) and commission again"
+            )
+    ecu.change({f"estimator.prior.{f.prior}.value": f.value for f in found})
+    ecu.save()
 
 
 def to_toml(machine: Machine, found: list[Finding], profile: str) -> str:

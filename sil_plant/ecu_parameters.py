@@ -130,6 +130,16 @@ class EcuParameters:
         number, entry = find_parameter(name)
         self._download(FIRST_PARAMETER + number, 0, struct.pack("<f", value), f"{name} = {value:g}", entry)
 
+    def change(self, values: dict[str, float]) -> None:
+        """Change several parameters, or none of them, until power-off."""
+        before = self.image()
+        try:
+            for name, value in values.items():
+                self.set(name, value)
+        except RefusedError:
+            self.load(before)
+            raise
+
     def save(self) -> None:
         """Keep what is in use over power-off."""
         self._sdo.RESPONSE_TIMEOUT = STORE_LIMIT_S

@@ -116,6 +116,7 @@ def over_bus(
     progress: Callable[[int], None],
     quiet: bool,
     plant: ExternalPlant | None = None,
+    afterwards: Callable[[str], None] | None = None,
 ) -> float:
     """Run the session with an ECU on a bus.
 
@@ -135,6 +136,9 @@ def over_bus(
         Say nothing but errors.
     plant : ExternalPlant, optional
         Another plant than ours.
+    afterwards : callable or None
+        Called with the bus string at the end of a run, with the valves shut and the ECU in PRE-OPERATIONAL: it answers
+        SDO.
 
     Returns
     -------
@@ -165,7 +169,12 @@ def over_bus(
         except BusError as error:
             bus_run.close_valves(run, plant)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
-        return time.perf_counter() - start
+        wall_s = time.perf_counter() - start
+        if afterwards is not None:
+            bus_run.park_ecu(port)
+            with bus_run.served(port):
+                afterwards(bus)
+        return wall_s
 
 
 def _always() -> None:
@@ -187,16 +196,25 @@ def check_faults(faults: tuple[Fault, ...], in_process: bool, spawned: bool) -> 
             raise ConfigError("ecu_killed needs an ECU that run.py may kill: --ecu spawn, or --bus inproc")
 
 
-def outcome(run: session.Session) -> str | None:
-    """What went wrong in a run that reached its end, or None. With faults on purpose, only how it ended counts."""
+def outcome(run: session.Session, mode: int = session.MODE_RUN) -> str | None:
+    """What went wrong in a run that reached its end, or None. With faults on purpose, only how it ended counts.
+
+    Parameters
+    ----------
+    run : Session
+        The run.
+    mode : int
+        The mode the ECU must be in at its end: RUN, or COMMISSION after a commissioning run.
+    """
     whole = run.monitor.whole
     on_purpose = len(run.injection.plan) > 0
     if whole[session.FAULTED] and not on_purpose:
         return f"the ECU went to FAULT (code {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h)"
-    if whole[session.MODE] != session.MODE_RUN:
-        mode = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
+    if whole[session.MODE] != mode:
+        ended = session.MODE_NAMES.get(int(whole[session.MODE]), "?")
         fault = f", fault {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h" if on_purpose else ""
-        return f"the ECU is in {mode}, not in RUN (last refusal {whole[session.LAST_REFUSAL]}{fault})"
+        wanted = session.MODE_NAMES[mode]
+        return f"the ECU is in {ended}, not in {wanted} (last refusal {whole[session.LAST_REFUSAL]}{fault})"
     if whole[session.REFUSED] and not on_purpose:
         return f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
     return None

@@ -9,7 +9,6 @@ from typing import NamedTuple
 from sil_plant.commissioning import (
     COMMISSION_SCENARIO,
     Finding,
-    commissioning_machine,
     findings,
     plant_when_commissioned,
 )
@@ -18,7 +17,7 @@ from sil_plant.inproc import InprocEcu, run_inproc
 from sil_plant.machine import Machine, parameter_image, with_changes
 from sil_plant.results import Result, run_of, summarise
 from sil_plant.scenario import Profile, Scenario, load_scenario
-from sil_plant.session import FAULTED, Session, make_session
+from sil_plant.session import FAULTED, REQUEST_COMMISSION, REQUEST_RUN, Session, make_session
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,7 @@ class Setup:
     seed: int = 1
     tare: bool = False
     scalar: str = "double"
+    start_request: int = REQUEST_RUN
 
 
 class Outcome(NamedTuple):
@@ -65,7 +65,13 @@ def setup_for(machine: Machine, profile: Profile, scenario: Scenario, **options:
 def simulate(setup: Setup) -> Outcome:
     """Run ECU and plant to the end."""
     session = make_session(
-        setup.plant_machine, setup.scenario, setup.controller, setup.seed, PERIOD_US * 1e-6, setup.tare
+        setup.plant_machine,
+        setup.scenario,
+        setup.controller,
+        setup.seed,
+        PERIOD_US * 1e-6,
+        setup.tare,
+        setup.start_request,
     )
     ecu = InprocEcu(parameter_image(setup.machine), PERIOD_US, setup.scalar)
     start = time.perf_counter()
@@ -84,13 +90,9 @@ def simulate(setup: Setup) -> Outcome:
 
 
 def commissioning_setup(machine: Machine, profile: Profile, seed: int, move: Scenario) -> Setup:
-    """The run that identifies a machine: the ECU with its commissioning priors, the plant before it aged."""
-    setup = setup_for(machine, profile, move, seed=seed)
-    return replace(
-        setup,
-        machine=commissioning_machine(setup.machine),
-        plant_machine=plant_when_commissioned(setup.plant_machine),
-    )
+    """The run that identifies a machine: the ECU in its mode COMMISSION, the plant before it aged."""
+    setup = setup_for(machine, profile, move, seed=seed, start_request=REQUEST_COMMISSION)
+    return replace(setup, plant_machine=plant_when_commissioned(setup.plant_machine))
 
 
 def commission(

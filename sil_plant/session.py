@@ -43,9 +43,10 @@ PARKED_S = 0.25  # with the pump off, where the pressures are tared
 CONTROLLERS = ("pid", "diarc-noload", "diarc")
 
 ECU_NODE, IO_NODE = 1, 2
-NMT_START, NMT_STOP, NMT_RESET = 1, 2, 129  # commands
+NMT_START, NMT_STOP, NMT_ENTER_PRE_OPERATIONAL, NMT_RESET = 1, 2, 128, 129  # commands
 NMT_STOPPED, NMT_OPERATIONAL, NMT_PRE_OPERATIONAL = 4, 5, 127  # states
 REQUEST_STANDBY, REQUEST_RUN, REQUEST_MOVE, REQUEST_RESET_FAULT, REQUEST_TARE = 1, 2, 3, 4, 5
+REQUEST_COMMISSION = 7
 MODE_NAMES = {
     0: "INIT",
     1: "STANDBY",
@@ -272,7 +273,9 @@ def make_timeline(period_s: float, tare: bool) -> Timeline:
     )
 
 
-def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Schedule:
+def make_schedule(
+    scenario: Scenario, controller: str, timeline: Timeline, start_request: int = REQUEST_RUN
+) -> Schedule:
     """Every frame of the master and every change of the load, by tick."""
     period_s = timeline.period_s
     angle_step = protocol.scale("MOTION", "Target")
@@ -284,7 +287,7 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
     rows.append(
         (
             timeline.run_request,
-            motion_frame(counter, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
+            motion_frame(counter, start_request, controller=CONTROLLERS.index(controller)),
         )
     )
     move_tick, move_joint, move_target, move_ticks = [], [], [], []
@@ -315,12 +318,12 @@ def make_schedule(scenario: Scenario, controller: str, timeline: Timeline) -> Sc
     )
 
 
-def recovery_frames(controller: str) -> np.ndarray:
-    """What brings an ECU back to RUN: from INIT, from STANDBY or HOLD, from FAULT, and the right DBC hash; (4, 16)."""
+def recovery_frames(controller: str, start_request: int = REQUEST_RUN) -> np.ndarray:
+    """What brings an ECU back to its moves: from INIT, from STANDBY or HOLD, from FAULT, and the right hash; (4, 16)."""
     return np.array(
         [
             nmt_frame(NMT_START, node=0),
-            motion_frame(0, REQUEST_RUN, controller=CONTROLLERS.index(controller)),
+            motion_frame(0, start_request, controller=CONTROLLERS.index(controller)),
             motion_frame(0, REQUEST_RESET_FAULT),
             injection.hash_frame(protocol.dbc_hash()),
         ],
@@ -354,6 +357,7 @@ def make_session(
     seed: int,
     period_s: float,
     tare: bool = False,
+    start_request: int = REQUEST_RUN,
 ) -> Session:
     """Put a run together.
 
@@ -371,6 +375,8 @@ def make_session(
         The ECU's tick.
     tare : bool
         Begin with the pump off and tare the pressure sensors.
+    start_request : int
+        The request that starts the law: ``REQUEST_RUN``, or ``REQUEST_COMMISSION`` to identify the arm.
 
     Raises
     ------
@@ -398,7 +404,7 @@ def make_session(
             theta=np.full(len(THETA), np.nan),
             theta_sd=np.full(len(THETA), np.nan),
         ),
-        schedule=make_schedule(scenario, controller, timeline),
+        schedule=make_schedule(scenario, controller, timeline, start_request),
         progress=Progress(np.zeros(4, dtype=np.int64), np.zeros((2, 4))),
         record=Record(
             state=np.zeros((ticks, STATES)),
@@ -413,7 +419,7 @@ def make_session(
         ),
         noise=sensor_noise(plant_machine, seed, ticks),
         injection=injection.make_injection(
-            scenario.faults, timeline.motion, period_s, seed, recovery_frames(controller)
+            scenario.faults, timeline.motion, period_s, seed, recovery_frames(controller, start_request)
         ),
         faulty=bool(scenario.faults),
     )

@@ -6,7 +6,7 @@ Examples
   python tools/params.py get wrist.q_max_rad
   python tools/params.py set control.swing.k1_1_s 60          in use at once, until power-off
   python tools/params.py save                                 .. and after it
-  python tools/params.py load out/reference.commissioned.toml a whole machine, or nothing of it
+  python tools/params.py load sil_plant/arms/loader.toml      a whole machine, or nothing of it
   python tools/params.py diff                                 what differs from the reference arm
   python tools/params.py restore                              the ECU's default, from its next start on
   python tools/params.py --bus tcp:127.0.0.1:29536 list       another bus than vcan0

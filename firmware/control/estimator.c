@@ -349,8 +349,8 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
     }
     const variance innovation = update_block(&e->covariance_h, phi, constants->noise_h[i], residual,
                                              constants->scale_h, parameters->h, e->theta_h);
-    if (absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
-        e->hydraulics[i].strikes = 0;
+    if (e->commissioning || absolute(residual) <= mul(parameters->innovation_limit, sd_of(innovation))) {
+        e->hydraulics[i].strikes = 0; /* while the model is found out nothing contradicts it */
     } else if (e->hydraulics[i].strikes < UINT8_MAX) {
         e->hydraulics[i].strikes++;
     } else {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,9 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import commissioning, experiment
+from sil_plant import commissioning, execution, experiment, session
 from sil_plant.config import ConfigError
-from sil_plant.machine import ARMS, REFERENCE_ARM, Machine, load_machine, with_changes
+from sil_plant.ecu_parameters import RefusedError
+from sil_plant.inproc import InprocEcu, run_inproc
+from sil_plant.machine import ARMS, REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes
+from sil_plant.results import run_of, summarise
 from sil_plant.scenario import (
     DEFAULT_SCENARIO,
     SCENARIOS,
@@ -90,6 +94,44 @@ def test_commissioned_arm_does_not_weigh_worse_than_the_paper(reference: Machine
     assert 1e-5 < abs(good.load_err_kg) < 0.005
 
 
+def test_run_after_commission_does_not_forget_what_was_found(reference: Machine, paper: Scenario) -> None:
+    """GIVEN a wrist of 6 kg that the machine file says weighs 5 WHEN commissioned, then run with 5 kg, the ECU never
+    off THEN the load is right within the paper's bar, which it is not by the kilogram that was found.
+    """
+    plant = with_changes(reference, {"wrist.mass_kg": 6.0}, "test")
+    period_s = execution.PERIOD_US * 1e-6
+    ecu = InprocEcu(parameter_image(reference), execution.PERIOD_US)
+    move = load_scenario(commissioning.COMMISSION_SCENARIO)
+    first = session.make_session(plant, move, "diarc", TUNING_SEED, period_s, start_request=session.REQUEST_COMMISSION)
+    ticks = len(first.noise)
+    standby = session.motion_frame(14, session.REQUEST_STANDBY)
+    schedule = first.schedule._replace(
+        frame_tick=np.append(first.schedule.frame_tick, ticks - 400),
+        frame_row=np.vstack([first.schedule.frame_row, standby]),
+    )
+    run_inproc(first._replace(schedule=schedule), ecu, ticks + 1)
+    assert set(first.record.mode) >= {session.MODE_STANDBY, session.MODE_COMMISSION}
+    assert session.MODE_RUN not in first.record.mode
+    assert first.monitor.whole[session.MODE] == session.MODE_STANDBY
+    second = session.make_session(plant, with_load(paper, 5.0), "diarc", RUN_SEED, period_s)
+    run_inproc(second, ecu, len(second.noise) + 1)
+    assert execution.outcome(second) is None
+    result = summarise(second.record, run_of(second, "diarc", reference.name, paper.name, RUN_SEED, "inproc", 1.0))
+    assert 1e-6 < abs(result.load_err_kg) < 0.003
+    assert 1e-6 < max(v for v in result.peak_err_after_1s_rad if v is not None) < 1e-4
+
+
+def test_run_that_ended_in_another_mode_is_not_a_success(reference: Machine) -> None:
+    """GIVEN a commissioning run WHEN judged THEN good as one, and as no other; a plain run is not commissioning."""
+    move = replace(load_scenario(commissioning.COMMISSION_SCENARIO), duration_s=0.5)
+    setup = experiment.commissioning_setup(reference, load_profile("paper"), 1, move)
+    commissioned = experiment.simulate(setup).session
+    assert execution.outcome(commissioned, session.MODE_COMMISSION) is None
+    assert "in COMMISSION, not in RUN" in str(execution.outcome(commissioned))
+    plain = experiment.simulate(replace(setup, start_request=session.REQUEST_RUN)).session
+    assert "in RUN, not in COMMISSION" in str(execution.outcome(plain, session.MODE_COMMISSION))
+
+
 def test_table_does_not_hide_a_parameter(stored: tuple[subprocess.CompletedProcess[str], Path]) -> None:
     """GIVEN a commissioning run WHEN it ends THEN each parameter stands there with sd and excitation."""
     result, path = stored
@@ -136,9 +178,65 @@ def test_bus_does_not_change_what_is_found(
     assert (tmp_path / "set.toml").read_bytes() == stored[1].read_bytes()
 
 
+def test_ecu_does_not_forget_what_it_was_to_save(
+    stored: tuple[subprocess.CompletedProcess[str], Path], tmp_path: Path
+) -> None:
+    """GIVEN an ECU that keeps its parameters WHEN commissioned with --save
+    THEN its memory has the very image that the tool wrote, found on it as in process.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        bus = f"tcp:127.0.0.1:{free.getsockname()[1]}"
+    command = [str(execution.ECU_BINARY), bus, "--pace", "lockstep", "--quiet", "--store", str(tmp_path / "store")]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as ecu:
+        try:
+            result = commission_py("--bus", bus, "--save", "-o", "set.toml", cwd=tmp_path)
+        finally:
+            ecu.terminate()
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "set.toml").read_bytes() == stored[1].read_bytes()
+    assert (tmp_path / "set.params").read_bytes() in (tmp_path / "store").read_bytes()
+
+
+class OtherEcu:
+    """As EcuParameters, of an ECU with a machine of its own that refuses one parameter."""
+
+    def __init__(self, machine: Machine) -> None:
+        self.own = parameter_image(machine)
+        self.changed: list[str] = []
+        self.saved = False
+
+    def image(self) -> bytes:
+        return self.own
+
+    def change(self, values: dict[str, float]) -> None:
+        self.changed += values
+
+    def save(self) -> None:
+        self.saved = True
+
+
+def test_set_is_not_saved_in_another_machines_ecu(reference: Machine) -> None:
+    """GIVEN an ECU whose arm has another link WHEN the set is to be saved in it THEN refused, naming the parameter and
+    the next step; an ECU that differs in what was commissioned alone takes it.
+    """
+    _, found = experiment.commission(
+        reference, load_profile("paper"), 1, replace(load_scenario(commissioning.COMMISSION_SCENARIO), duration_s=1.0)
+    )
+    other = OtherEcu(with_changes(reference, {"wrist.link_length_m": 0.41}, "test"))
+    with pytest.raises(RefusedError, match=r"wrist\.link_length_m is 0\.41.*params\.py load"):
+        commissioning.save_in_ecu(other, reference, found)
+    assert not other.changed and not other.saved
+    older = OtherEcu(with_changes(reference, {"estimator.prior.m2_kg.value": 5.5}, "test"))
+    commissioning.save_in_ecu(older, reference, found)
+    assert len(older.changed) == 13 and older.saved
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
+        (("--save",), r"--save is for an ECU that stays"),
+        (("--save", "--bus", "slcan:/dev/null"), r"--save needs a bus that two programs can share"),
         (("--arm", "none.toml"), r"none\.toml: cannot be read"),
         (("-o", "no/where.toml"), r"no/where\.toml: its folder does not exist"),
         (("--bus", "nonsense:1"), r"nonsense"),
