@@ -319,7 +319,7 @@ def make_schedule(
 
 
 def recovery_frames(controller: str, start_request: int = REQUEST_RUN) -> np.ndarray:
-    """What brings an ECU back to its moves: from INIT, from STANDBY or HOLD, from FAULT, and the right hash; (4, 16)."""
+    """What brings an ECU back to its moves: from INIT, STANDBY or HOLD, FAULT, and the right hash; (4, 16)."""
     return np.array(
         [
             nmt_frame(NMT_START, node=0),
