@@ -136,8 +136,8 @@ static uint32_t root_of_word(uint32_t x)
     upper = (upper + top / upper) >> 1; /* at most one too large */
     upper -= upper * upper > top ? 1u : 0u;
     const uint32_t rest = (top - upper * upper) << 8 | (x >> 8 & 0xFFu);
-    const uint32_t root = (upper << 8) + rest / (2u * upper);
-    return root > 0xFFFFu || root * root > x ? root - 1u : root;
+    const uint32_t found = (upper << 8) + rest / (2u * upper);
+    return found > 0xFFFFu || found * found > x ? found - 1u : found;
 }
 
 /* floor(sqrt(x)), 0 < x < 2^62: 16 bits of the root by 16. */
@@ -150,9 +150,9 @@ static uint32_t integer_root(uint64_t x)
     const uint32_t high = (uint32_t)(normal >> 32);
     const uint32_t upper = root_of_word(high);
     const uint32_t rest = high - upper * upper; /* up to 17 bits: both sides of the quotient are halved */
-    const uint64_t root = ((uint64_t)upper << 16) + (rest << 15 | (uint32_t)normal >> 17) / upper;
-    const bool too_large = root > UINT32_MAX || root * root > normal;
-    return (uint32_t)((too_large ? root - 1u : root) >> (shift / 2u));
+    const uint64_t found = ((uint64_t)upper << 16) + (rest << 15 | (uint32_t)normal >> 17) / upper;
+    const bool too_large = found > UINT32_MAX || found * found > normal;
+    return (uint32_t)((too_large ? found - 1u : found) >> (shift / 2u));
 }
 
 scalar root(scalar x)
