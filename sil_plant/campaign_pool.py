@@ -7,6 +7,7 @@ from numba's cache, which is warm by then.
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
+QUEUED_PER_WORKER = 4  # batches, so that none is ever idle, and the queue stays short however long the campaign
 DEATHS_MOST = 2  # a batch whose workers die so often is given up
 CONNECT_S = 10.0
 LOOK_S = 0.5  # how often the cluster is looked at while nothing is finished
@@ -60,9 +62,14 @@ def in_processes(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPool(min(workers, max(len(jobs), 1)), context=context, initializer=_leave_ctrl_c_to_the_parent)
     deaths = [0] * len(jobs)
+    waiting = iter(range(len(jobs)))
+    running: dict[Future, int] = {}
     try:
-        running: dict[Future, int] = {pool.schedule(work, args): n for n, (_, args) in enumerate(jobs)}
-        while running:
+        while True:
+            for n in itertools.islice(waiting, max(QUEUED_PER_WORKER * workers - len(running), 0)):
+                running[pool.schedule(work, jobs[n][1])] = n
+            if not running:
+                break
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in finished:
                 n = running.pop(future)
@@ -146,7 +153,8 @@ def _connect(address: str) -> Client:
         raise ConfigError(
             'the package distributed is missing; install the extra: .venv/bin/pip install ".[cluster]"'
         ) from error
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to the cluster is said here
+    for logger in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
+        logging.getLogger(logger).setLevel(logging.CRITICAL + 1)  # what happens to the cluster is said here
     try:
         return Client(address, timeout=CONNECT_S, set_as_default=False, name="diarc-campaign")
     except (OSError, TimeoutError, ValueError) as error:
@@ -160,11 +168,18 @@ def _compute(
     client: Client, base: Base, todo: Sequence[Batch], code: str, address: str, say: Say
 ) -> Iterator[tuple[Batch, Rows | None]]:
     from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
 
-    running = {client.submit(run_batch, base, batch.arms, code, pure=False): batch for batch in todo}
-    known: set[str] = set()
+    waiting = iter(todo)
+    running: dict[Any, Batch] = {}
+    known = _workers(client, address)
     alone_since: float | None = None
-    while running:
+    while True:
+        room = QUEUED_PER_WORKER * max(len(known), 1) - len(running)
+        for batch in itertools.islice(waiting, max(room, 0)):
+            running[client.submit(run_batch, base, batch.arms, code, pure=False)] = batch
+        if not running:
+            break
         finished = [future for future in running if future.done()]
         if not finished:
             time.sleep(LOOK_S)
@@ -181,7 +196,7 @@ def _compute(
             batch = running.pop(future)
             try:
                 yield batch, future.result()
-            except CancelledError as error:
+            except (CancelledError, CommClosedError) as error:
                 raise ClusterLostError(f"the scheduler at {address} has gone away") from error
             except KilledWorker:
                 say(f"{batch.name} killed their workers and are left out")

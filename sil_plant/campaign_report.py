@@ -66,7 +66,7 @@ def trace_of_run(run: ArmRun) -> Trace | None:
 
 
 def worst_picture(base: Base, arm: Arm) -> str:
-    """The picture of one of the worst runs, made anew; work for any process."""
+    """The picture of one of the worst runs, made anew; with its trace."""
     trace = trace_of_run(run_arm(base, arm))
     return "" if trace is None else svg(campaign_figures.run(trace), f"run{arm.run}")
 
@@ -198,9 +198,9 @@ def figures_table(summary: Summary) -> str:
 
 
 def ends_table(summary: Summary) -> str:
-    """How the arms ended, and which faults the ECU reported."""
+    """How the arms ended, and which emergencies of the ECU were heard; not every one ends a run."""
     rows = [[name, share_text(one)] for name, one in summary.statuses.items()]
-    rows += [[f"fault {name}", share_text(one)] for name, one in summary.faults.items()]
+    rows += [[f"emergency {name} heard", share_text(one)] for name, one in summary.faults.items()]
     return table(["arms", "how many"], rows)
 
 
@@ -252,10 +252,13 @@ def drivers_table(one: Drivers) -> str:
                 "yes" if seen else "no",
             ]
         )
-    explained = sum(d.index for d in one.drivers)
-    rest = "; the rest is noise and variables together" if explained < 0.95 else ""
+    chance = 0.0 if math.isnan(one.chance_index) else one.chance_index
+    explained = sum(d.index for d in one.drivers if d.index > chance)
     head = ["variable", "Sobol index", *(["total index"] if with_total else []), "rank correlation", "beyond chance"]
-    return table(head, rows) + paragraph(f"All first-order indices together: {explained:.2f}{rest}.")
+    return table(head, rows) + paragraph(
+        f"First-order indices beyond chance, together: {explained:.2f}; the rest is small variables, variables that "
+        "act together, and noise."
+    )
 
 
 def _worst_section(made: Made, rerun: Sequence[str]) -> list[str]:

@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
@@ -32,6 +33,7 @@ if __name__ == "__main__":
 
 from sil_plant.config import ConfigError  # noqa: E402
 
+NEEDED = ("SALib", "pebble", "pyarrow", "scipy")
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 OUT = ROOT / "out" / "campaigns"
 REPORT = "report.html"
@@ -65,6 +67,10 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        say(f"campaign.py: the package {missing[0]} is missing here; bring the environment in step: make setup")
+        return EXIT_WRONG_USE
     signal.signal(signal.SIGTERM, _interrupt)
     # imported here, for the workers that are spawned read this file, too
     from sil_plant.campaign_pool import ClusterLostError
@@ -135,7 +141,7 @@ def _run(arguments, campaign, folder, wanted, planned: int, note: str | None) ->
     wall_s = time.perf_counter() - start
     notes = [note] if note else []
     notes += [f"Missing: {batch.name}, for they killed their worker {pool.DEATHS_MOST} times." for batch in left_out]
-    text = _report(arguments, campaign, folder, wanted, planned, tuple(notes), workers)
+    text = _report(arguments, campaign, folder, wanted, planned, tuple(notes))
     if not arguments.quiet:
         show(text)
         if computed:
@@ -146,9 +152,8 @@ def _run(arguments, campaign, folder, wanted, planned: int, note: str | None) ->
     return EXIT_FAILED if left_out else 0
 
 
-def _report(arguments, campaign, folder, wanted, planned: int, notes: tuple[str, ...], workers: int) -> str:
+def _report(arguments, campaign, folder, wanted, planned: int, notes: tuple[str, ...]) -> str:
     """Write the report; its table for people."""
-    from sil_plant import campaign_pool as pool
     from sil_plant import campaign_report as report
     from sil_plant.campaign_results import write_whole
     from sil_plant.campaign_statistics import summary
@@ -158,8 +163,7 @@ def _report(arguments, campaign, folder, wanted, planned: int, notes: tuple[str,
         raise ConfigError(f"{folder.path}: there are no results to report on")
     found = summary(campaign, rows, planned)
     by_run = {arm.run: arm for batch in wanted for arm in batch.arms}
-    jobs = [(run, (campaign.base, by_run[run])) for run in found.worst]
-    drawn = dict(pool.in_processes(report.worst_picture, jobs, workers, _tell, lambda run: f"run {run}'s picture"))
+    drawn = {run: report.worst_picture(campaign.base, by_run[run]) for run in found.worst}
     command = f"python tools/campaign.py {campaign.path}" + (f" --runs {campaign.runs}" if arguments.runs else "")
     made = report.Made(campaign, rows, found, drawn, folder.code, notes, command)
     rerun = [report.rerun_command(campaign, run, arguments.runs) for run in found.worst]
@@ -251,7 +255,8 @@ def _with_progress(results: Iterator, planned: int, done: int, quiet: bool) -> I
     )
 
     console = Console(stderr=True)
-    first, start, said = done, time.monotonic(), time.monotonic()
+    first: int | None = None
+    start = said = time.monotonic()
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
         TimeRemainingColumn(), console=console, transient=True, disable=quiet or not console.is_terminal,
@@ -264,10 +269,12 @@ def _with_progress(results: Iterator, planned: int, done: int, quiet: bool) -> I
             done += len(batch.arms)
             bar.update(task, completed=done)
             now = time.monotonic()
+            if first is None:  # the time until the first batch is the workers' start
+                first, start = done, now
             if not quiet and not console.is_terminal and now - said > SAY_EVERY_S:
                 said = now
-                left_s = (planned - done) * (now - start) / (done - first)
-                say(f"campaign.py: {done} of {planned} runs, about {left_s:.0f} s left")
+                left = f", about {(planned - done) * (now - start) / (done - first):.0f} s left" if done > first else ""
+                say(f"campaign.py: {done} of {planned} runs{left}")
 
 
 def _tell(text: str) -> None:
