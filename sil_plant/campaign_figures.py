@@ -18,6 +18,7 @@ from sil_plant.figures import (
     JOINT_COLOURS,
     LOAD_COLOUR,
     REFERENCE_COLOUR,
+    SETTLED_S,
     STYLE,
     TRUTH_COLOUR,
     WIDTH_PX,
@@ -98,24 +99,28 @@ def drivers(found: statistics.Drivers) -> Figure:
 
 
 def run(trace: Trace) -> Figure:
-    """One run in a row: angles, tracking errors, load estimate."""
+    """One run in a row from the start of motion: angles, tracking errors, error of the load's estimate."""
+    moving = trace.time_s >= 0.0
+    time_s, late = trace.time_s[moving], trace.time_s[moving] >= SETTLED_S
+    load_error = (trace.load_est_kg - trace.load_true_kg)[moving]
     with _figure(0.25) as figure:
         angles, errors, load = figure.subplots(1, 3)
         for joint, name in enumerate(JOINT_NAMES):
             wide = {"color": REFERENCE_COLOUR, "linewidth": 4.0}
-            _line(angles, trace.time_s, trace.reference_rad[:, joint], **wide)
-            _line(angles, trace.time_s, trace.angle_rad[:, joint], color=JOINT_COLOURS[joint], label=name)
-            _line(errors, trace.time_s, trace.error_mrad[:, joint], color=JOINT_COLOURS[joint], linewidth=1.0)
-        _line(load, trace.time_s, trace.load_est_kg, color=LOAD_COLOUR, label="estimate")
-        _line(load, trace.time_s, trace.load_true_kg, color=TRUTH_COLOUR, linestyle=(0, (5, 3)), label="true")
-        for axes, title in ((angles, "angle, rad"), (errors, "error, mrad"), (load, "load, kg")):
+            _line(angles, time_s, trace.reference_rad[moving, joint], **wide)
+            _line(angles, time_s, trace.angle_rad[moving, joint], color=JOINT_COLOURS[joint], label=name)
+            _line(errors, time_s, trace.error_mrad[moving, joint], color=JOINT_COLOURS[joint], linewidth=1.0)
+        load.axhline(0.0, color=TRUTH_COLOUR, linewidth=0.8)
+        _line(load, time_s, load_error, color=LOAD_COLOUR)
+        settled = 1.5 * float(np.abs(load_error[late]).max(initial=0.02))  # not what it is before the first motion
+        load.set_ylim(-settled, settled)
+        for axes, title in ((angles, "angle, rad"), (errors, "tracking error, mrad"), (load, "load error, kg")):
             axes.set_title(title)
             axes.set_xlabel("time, s")
             axes.margins(x=0.01)
-        for axes in (angles, load):
-            low, high = axes.get_ylim()
-            axes.set_ylim(low, high + 0.25 * (high - low))
-            axes.legend(loc="upper right", ncols=2, borderaxespad=0.2, handlelength=1.6)
+        low, high = angles.get_ylim()
+        angles.set_ylim(low, high + 0.25 * (high - low))
+        angles.legend(loc="upper right", ncols=2, borderaxespad=0.2, handlelength=1.6)
     return figure
 
 

@@ -31,7 +31,7 @@ Say = Callable[[str], None]
 QUEUED_PER_WORKER = 4  # batches, so that none is ever idle, and the queue stays short however long the campaign
 DEATHS_MOST = 2  # a batch whose workers die so often is given up
 CONNECT_S = 10.0
-LOOK_S = 0.5  # how often the cluster is looked at while nothing is finished
+LOOK_S = 0.1  # how often the cluster is looked at while nothing is finished
 NO_WORKERS_S = 30.0  # a scheduler that has no workers for so long has gone wrong
 
 

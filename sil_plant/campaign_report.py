@@ -296,7 +296,7 @@ def run_text(row: Mapping[str, Any]) -> str:
         f"rms {mrad('rms_err')}",
     ]
     if row["faults"]:
-        parts.append(f"faults: {row['faults']}")
+        parts.append(f"emergencies: {row['faults']}")
     if row["reason"]:
         parts.append(row["reason"])
     return "; ".join(parts) + "."
