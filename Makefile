@@ -9,7 +9,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet 
 C_FILES = find firmware tests/unit tests/fuzz tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images fmu budget demo paper test faults coverage fuzz fuzz-corpus lint format generate clean
+.PHONY: help setup firmware images fmu budget demo paper campaign test faults coverage fuzz fuzz-corpus lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -48,6 +48,11 @@ paper: ## the paper's figures and tables beside ours: out/paper/report.html
 	@tools/setup.sh demo
 	@$(MAKE) firmware
 	@$(PYTHON) tools/paper.py
+
+campaign: ## a thousand arms with production tolerances: out/campaigns/production/report.html
+	@tools/setup.sh demo
+	@$(MAKE) firmware
+	@$(PYTHON) tools/campaign.py sil_plant/campaigns/production.toml --resume
 
 test: ## every test: unit tests in C, then pytest
 	@tools/setup.sh test

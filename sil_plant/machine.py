@@ -296,3 +296,19 @@ def parameter_image(machine: Machine, changes: dict[str, Any] | None = None) -> 
     body += struct.pack("<4b", *(machine.base[key] for key in BASE_KEYS), 0)
     body += struct.pack(f"<{len(table.entries)}f", *(values[entry.name] for entry in table.entries))
     return body + struct.pack("<I", zlib.crc32(body))
+
+
+def key_ranges() -> dict[str, tuple[float, float]]:
+    """Every key that a machine file can have, and its range."""
+    return _ranges(load_parameter_table())
+
+
+def check_relations(machine: Machine) -> None:
+    """Check what no single range can tell, as for a machine file: rod and bore, joint range and lever arm, priors.
+
+    Raises
+    ------
+    ConfigError
+        Naming the keys.
+    """
+    _check_relations(TomlFile(machine.path), machine.values)
