@@ -27,6 +27,7 @@ from sil_plant.session import (
     nmt_frame,
     on_frame,
     on_sync,
+    rewind,
     without_sync,
 )
 
@@ -34,6 +35,7 @@ ECU_WAIT_S = 3.0
 BOOT_WAIT_S = 2.0
 # Longer than the ECU's own stall limit: a paused plant must not look like a dead ECU.
 ECU_LOST_S = 0.5
+COMMANDS_EVERY_TICKS = 10
 
 
 class EcuMissingError(Exception):
@@ -87,6 +89,16 @@ def _heard(port: FramePort, limit_s: float, wanted: Callable[[int, bytes], bool]
     return False
 
 
+class Commands(Protocol):
+    """What others may ask of a running plant."""
+
+    def serve(self, session: Session) -> Session:
+        """Carry out what has come since the last time; the session to go on with."""
+
+    def rewound(self, ticks: int) -> None:
+        """Told when an endless run counts its ticks anew."""
+
+
 class EcuPower(Protocol):
     """What switches an ECU of ours off and on again."""
 
@@ -103,6 +115,8 @@ def run_on_bus(
     progress: Callable[[int], None],
     alive: Callable[[], None],
     power: EcuPower | None = None,
+    commands: Commands | None = None,
+    endless: bool = False,
 ) -> None:
     """Run the session to its end; the ECU must just have booted.
 
@@ -118,6 +132,10 @@ def run_on_bus(
         Raises when an ECU that was spawned has ended.
     power : EcuPower or None
         Switches the ECU off and on again, for a scenario that has it killed.
+    commands : Commands or None
+        Asked between two ticks, now and then.
+    endless : bool
+        Go on after the end of the scenario, and when the ECU restarts; the record then has the last of it.
 
     Raises
     ------
@@ -145,11 +163,18 @@ def run_on_bus(
                 check_hash(session)
             rows = on_sync(session, data[0], out)
             if rows < 0:
-                return
+                if not endless:
+                    return
+                ticks = rewind(session)
+                if commands is not None:
+                    commands.rewound(ticks)
+                rows = on_sync(session, data[0], out)
             port.send_many([from_row(row) for row in out[:rows]])
+            if commands is not None and tick % COMMANDS_EVERY_TICKS == 0:
+                session = commands.serve(session)
             if tick % 100 == 0:
                 progress(tick)
-        elif can_id == heartbeat_id and data == b"\0" and not reboot_expected(session):
+        elif can_id == heartbeat_id and data == b"\0" and not (endless or reboot_expected(session)):
             close_valves(session)
             raise EcuLostError("the ECU restarted in the middle of the run; the valves are closed")
         elif can_id < 0x800:

@@ -108,6 +108,8 @@ def over_bus(
     image: bytes,
     progress: Callable[[int], None],
     quiet: bool,
+    commands: bus_run.Commands | None = None,
+    endless: bool = False,
 ) -> float:
     """Run the session with an ECU on a bus.
 
@@ -125,6 +127,10 @@ def over_bus(
         Told the tick now and then.
     quiet : bool
         Say nothing but errors.
+    commands : Commands or None
+        What others may ask of the plant.
+    endless : bool
+        Go on after the end of the scenario.
 
     Returns
     -------
@@ -151,7 +157,7 @@ def over_bus(
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
         try:
-            bus_run.run_on_bus(run, port, progress, alive, ecu)
+            bus_run.run_on_bus(run, port, progress, alive, ecu, commands, endless)
         except BusError as error:
             bus_run.close_valves(run)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error
