@@ -78,7 +78,7 @@ class Command:
     what: str
 
 
-class _Request:
+class Request:
     """One request, read as a scenario's table is; its errors name no file."""
 
     def __init__(self, values: dict[str, Any]) -> None:
@@ -234,7 +234,7 @@ class Control:
     def _set_load(self, session: Session, values: dict[str, Any]) -> str:
         if set(values) != {"kg"}:
             raise ConfigError("load needs kg, and nothing else")
-        load_kg = _Request(values).number("kg", values["kg"], 0.0, self._hello.heaviest_kg)
+        load_kg = Request(values).number("kg", values["kg"], 0.0, self._hello.heaviest_kg)
         session.node.load[0] = load_kg
         return f"load {load_kg:g} kg"
 
@@ -245,7 +245,7 @@ class Control:
         if tick < timeline.motion:
             raise ConfigError("not before motion starts")
         start_s = (tick - timeline.motion) * timeline.period_s
-        fault = read_fault(_Request(values), values | {"start_s": start_s}, 0)
+        fault = read_fault(Request(values), values | {"start_s": start_s}, 0)
         check_faults((fault,), in_process=False, spawned=self._hello.spawned)
         changed = injection.with_fault(session.injection, fault, timeline.motion, timeline.period_s)
         if not session.faulty:
