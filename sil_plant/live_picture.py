@@ -19,6 +19,7 @@ WIDTH, HEIGHT = 1200, 815
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _LOAD_LIMIT_MS, _LIMIT_S = 60_000, 180.0
 _STOP_S = 20.0
+_FADE_MS = 800.0
 BEFORE_S, AFTER_S = 9.0, 8.6  # and after something has changed: so long it is watched
 # WebGL by the processor, for computers without a screen
 _FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--mute-audio")
@@ -100,6 +101,7 @@ class Picture:
                     action()
                 for notice in page.locator(".mantine-Notification-closeButton").all():
                     notice.click()  # "no graphics card here"
+                page.wait_for_timeout(_FADE_MS)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 page.screenshot(path=str(path))
             self.problem = ""

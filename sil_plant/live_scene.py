@@ -220,7 +220,7 @@ class Scene:
             angle = angles_rad[joint]  # type: ignore[index]
             barrel.wxyz = turned(part.direction_rad(angle))
             rod.position = (part.length_m(angle), 0.0, 0.0)
-        self._label.position = self.shape.tip(angles_rad) + np.array([0.0, 0.0, 2.4 * self.shape.width_m])  # type: ignore[arg-type]
+        self._label.position = self.shape.tip(angles_rad) + np.array([0.0, 0.0, 3.4 * self.shape.width_m])  # type: ignore[arg-type]
 
     def show_load(self, kg: float | None, sd_kg: float | None, true_kg: float | None) -> None:
         """Give the balls their sizes."""

@@ -15,7 +15,7 @@ from sil_plant.watch import JOINTS, Snapshot
 NETWORK = {"START": (1, "OPERATIONAL"), "STOP": (2, "STOPPED"), "RESET": (129, "PRE_OPERATIONAL")}
 DRIVING = ("RUN", "COMMISSION")
 _SHORTEST_REST_S = 0.1
-_ARRIVED_RAD = 1e-3
+_ARRIVED_RAD = 2.5e-6  # of the reference: a move ends so gently that 1 mrad is left for its last tenth
 _ARRIVAL_S = 3.0  # so much later than planned the next move is made in any case
 _CONTROLLER_LIMIT_S = 3.0
 _RESTING = ("STANDBY", "INIT", "FAULT")
@@ -92,6 +92,7 @@ class Master:
         self._changing_since_s: float | None = None
         self.repeat = False
         self.controller = "diarc"
+        request_frames("NONE", 0)  # compiles what packs a frame, before a bus waits for one
 
     def request(
         self, request: str, *, joint: str = JOINTS[0], target_rad: float = 0.0, duration_s: float = 1.0
