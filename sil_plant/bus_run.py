@@ -30,6 +30,7 @@ from sil_plant.session import (
     nmt_frame,
     on_frame,
     on_sync,
+    rewind,
     without_sync,
 )
 
@@ -37,6 +38,7 @@ ECU_WAIT_S = 3.0
 BOOT_WAIT_S = 2.0
 # Longer than the ECU's own stall limit: a paused plant must not look like a dead ECU.
 ECU_LOST_S = 0.5
+COMMANDS_EVERY_TICKS = 10
 
 
 class EcuMissingError(Exception):
@@ -90,6 +92,16 @@ def _heard(port: FramePort, limit_s: float, wanted: Callable[[int, bytes], bool]
     return False
 
 
+class Commands(Protocol):
+    """What others may ask of a running plant."""
+
+    def serve(self, session: Session) -> Session:
+        """Carry out what has come since the last time; the session to go on with."""
+
+    def rewound(self, ticks: int) -> None:
+        """Told when an endless run counts its ticks anew."""
+
+
 class EcuPower(Protocol):
     """What switches an ECU of ours off and on again."""
 
@@ -107,6 +119,8 @@ def run_on_bus(
     alive: Callable[[], None],
     power: EcuPower | None = None,
     plant: ExternalPlant | None = None,
+    commands: Commands | None = None,
+    endless: bool = False,
 ) -> None:
     """Run the session to its end; the ECU must just have booted.
 
@@ -124,6 +138,10 @@ def run_on_bus(
         Switches the ECU off and on again, for a scenario that has it killed.
     plant : ExternalPlant, optional
         Another plant than ours.
+    commands : Commands or None
+        Asked between two ticks, now and then.
+    endless : bool
+        Go on after the end of the scenario, and when the ECU restarts; the record then has the last of it.
 
     Raises
     ------
@@ -153,11 +171,18 @@ def run_on_bus(
                 check_hash(session)
             rows = on_sync(session, data[0], out) if plant is None else plant.on_sync(session, data[0], out)
             if rows < 0:
-                return
+                if not endless:
+                    return
+                ticks = rewind(session)
+                if commands is not None:
+                    commands.rewound(ticks)
+                rows = on_sync(session, data[0], out)
             port.send_many([from_row(row) for row in out[:rows]])
+            if commands is not None and tick % COMMANDS_EVERY_TICKS == 0:
+                session = commands.serve(session)
             if tick % 100 == 0:
                 progress(tick)
-        elif can_id == heartbeat_id and data == b"\0" and not reboot_expected(session):
+        elif can_id == heartbeat_id and data == b"\0" and not (endless or reboot_expected(session)):
             close_valves(session, plant)
             raise EcuLostError("the ECU restarted in the middle of the run; the valves are closed")
         elif can_id < 0x800:

@@ -117,6 +117,8 @@ def over_bus(
     quiet: bool,
     plant: ExternalPlant | None = None,
     afterwards: Callable[[str], None] | None = None,
+    commands: bus_run.Commands | None = None,
+    endless: bool = False,
 ) -> float:
     """Run the session with an ECU on a bus.
 
@@ -139,6 +141,10 @@ def over_bus(
     afterwards : callable or None
         Called with the bus string at the end of a run, with the valves shut and the ECU in PRE-OPERATIONAL: it answers
         SDO.
+    commands : Commands or None
+        What others may ask of the plant.
+    endless : bool
+        Go on after the end of the scenario.
 
     Returns
     -------
@@ -165,7 +171,7 @@ def over_bus(
         bus_run.wait_for_ecu(port, bus, alive)
         start = time.perf_counter()
         try:
-            bus_run.run_on_bus(run, port, progress, alive, ecu, plant)
+            bus_run.run_on_bus(run, port, progress, alive, ecu, plant, commands, endless)
         except BusError as error:
             bus_run.close_valves(run, plant)
             raise bus_run.EcuLostError(f"{error}; the valves are closed") from error

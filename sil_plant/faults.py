@@ -152,10 +152,26 @@ def read_faults(toml: TomlFile) -> tuple[Fault, ...]:
     items = toml.data.get("faults", [])
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise toml.error("faults", "a list of tables [[faults]] is needed")
-    return tuple(_fault(toml, item, n) for n, item in enumerate(items))
+    return tuple(read_fault(toml, item, n) for n, item in enumerate(items))
 
 
-def _fault(toml: TomlFile, item: dict[str, Any], n: int) -> Fault:
+def read_fault(toml: TomlFile, item: dict[str, Any], n: int) -> Fault:
+    """Read and check one fault.
+
+    Parameters
+    ----------
+    toml : TomlFile
+        Makes the messages.
+    item : dict
+        The table.
+    n : int
+        Which of the list it is.
+
+    Raises
+    ------
+    ConfigError
+        Naming the key and what there is to choose from.
+    """
     for key in item:
         if key not in KEYS:
             raise toml.error(f"faults.{key}", f"is not a key of a fault; known are {', '.join(sorted(KEYS))}", n)

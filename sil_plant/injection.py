@@ -205,6 +205,37 @@ def make_injection(
     )
 
 
+def with_fault(present: Injection, fault: Fault, motion_tick: int, period_s: float) -> Injection:
+    """The injection of a run under way with one more fault; what is held and counted stays.
+
+    Parameters
+    ----------
+    present : Injection
+        As it is.
+    fault : Fault
+        Its ``start_s`` is from ``motion_tick`` on.
+    motion_tick, period_s : int, float
+        As of :func:`make_injection`.
+    """
+    fresh = make_injection((fault,), motion_tick, period_s, present.seed, present.row[:RECOVERY_ROWS])
+    count = present.count.copy()
+    waiting = present.recover[count[RECOVER_NEXT] :]
+    count[RECOVER_NEXT] = 0
+    return present._replace(
+        plan=np.vstack([present.plan, fresh.plan]),
+        size=np.concatenate([present.size, fresh.size]),
+        recover=np.sort(np.concatenate([waiting, fresh.recover])),
+        count=count,
+    )
+
+
+def rewind(injection: Injection, ticks: int) -> None:
+    """Let all times be so many ticks earlier."""
+    injection.plan[:, FIRST : LAST + 1] -= ticks
+    injection.recover[:] -= ticks
+    injection.held[:, 0] -= ticks
+
+
 # ---- what is active ------------------------------------------------------------------------------
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +26,9 @@ from sil_plant.session import (
     sync_lost,
     trace_sha256,
 )
+
+if TYPE_CHECKING:
+    from sil_plant.control import Command
 
 LOAD_BAND_KG = 0.1
 AFTER_S = 1.0
@@ -233,15 +238,23 @@ def check_writable(path: Path) -> None:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}; choose another file or folder") from error
 
 
-def write_json(path: Path, result: Result) -> None:
-    """Write the figures.
+def command_lines(commands: Sequence[Command]) -> list[str]:
+    """What was asked of the plant while it ran, for the table."""
+    return [f"  {'asked for':17} {command.time_s:.3f} s: {command.what}" for command in commands]
+
+
+def write_json(path: Path, result: Result, commands: Sequence[Command] | None = None) -> None:
+    """Write the figures, and what was asked of the plant where that was possible.
 
     Raises
     ------
     ConfigError
         When the file cannot be written.
     """
-    _write(path, json.dumps(asdict(result), indent=2) + "\n")
+    facts = asdict(result)
+    if commands is not None:
+        facts["commands"] = [asdict(command) for command in commands]
+    _write(path, json.dumps(facts, indent=2) + "\n")
 
 
 def write_csv(path: Path, record: Record, run: Run) -> None:

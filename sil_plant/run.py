@@ -35,7 +35,9 @@ from sil_plant import bus_run, execution, inproc, protocol, results, session  # 
 from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
 from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
+from sil_plant.control import DEFAULT_CONTROL_PORT, Command, Control, Hello  # noqa: E402
 from sil_plant.external_plant import ExternalPlant, PlantLostError  # noqa: E402
+from sil_plant.faults import Fault  # noqa: E402
 from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
 from sil_plant.scenario import (  # noqa: E402
     DEFAULT_SCENARIO,
@@ -49,6 +51,7 @@ from sil_plant.scenario import (  # noqa: E402
 )
 
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
+WARM_UP_FAULT = Fault("delayed", "motion", 0.0, 0.001, 1.0)  # compiles the plant that faults may come to
 
 
 def parse_arguments(argv: list[str]) -> argparse.Namespace:
@@ -75,11 +78,28 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write the trace, one row per tick")
     parser.add_argument("--quiet", action="store_true", help="no progress bar and no table")
+    parser.add_argument(
+        "--control",
+        type=int,
+        nargs="?",
+        const=DEFAULT_CONTROL_PORT,
+        metavar="PORT",
+        help=f"let programs on this computer change load and faults while it runs; default {DEFAULT_CONTROL_PORT}",
+    )
+    parser.add_argument("--endless", action="store_true", help="after the scenario's end go on, at rest, until Ctrl-C")
     arguments = parser.parse_args(argv)
     if arguments.pace and arguments.ecu != "spawn":
         parser.error("--pace is the spawned ECU's: it goes with --ecu spawn")
     if (arguments.fmu is None) != (arguments.map is None):
         parser.error("--fmu and --map go together: docs/fmu.md describes the map")
+    if arguments.bus.strip() == "inproc" and (arguments.control is not None or arguments.endless):
+        parser.error("--control and --endless are for a bus: --bus vcan0 or --bus tcp:127.0.0.1:29536")
+    if arguments.endless and (arguments.json or arguments.csv):
+        parser.error("--endless has no figures to write: leave --json and --csv out, or let it end: --duration")
+    if arguments.control is not None and not 0 <= arguments.control <= 65535:
+        parser.error(f"--control {arguments.control}: a port is 0 to 65535")
+    if arguments.fmu is not None and (arguments.control is not None or arguments.endless):
+        parser.error("--control and --endless are for our own plant: leave --fmu out")
     return arguments
 
 
@@ -139,14 +159,21 @@ def load_inputs(arguments: argparse.Namespace) -> Inputs:
     return Inputs(machine, plant_machine, scenario, profile.tare, address, plant)
 
 
-def write_outputs(arguments: argparse.Namespace, record: session.Record, run: results.Run, faults: list[str]) -> bool:
+def write_outputs(
+    arguments: argparse.Namespace,
+    record: session.Record,
+    run: results.Run,
+    faults: list[str],
+    commands: list[Command] | None,
+) -> bool:
     """Print the table and write what was recorded; one file that fails does not cost the others."""
+    faults = faults + results.command_lines(commands or [])
     result = results.summarise(record, run)
     if not arguments.quiet:
         show("\n".join([results.table(result, protocol.worst_case_bus_load()), *faults]))
     written = True
     for path, write in (
-        (arguments.json, lambda path: results.write_json(path, result)),
+        (arguments.json, lambda path: results.write_json(path, result, commands)),
         (arguments.csv, lambda path: results.write_csv(path, record, run)),
     ):
         try:
@@ -156,6 +183,18 @@ def write_outputs(arguments: argparse.Namespace, record: session.Record, run: re
             say(f"run.py: {error}")
             written = False
     return written
+
+
+def open_control(arguments: argparse.Namespace, machine: Machine) -> Control | None:
+    """Listen for those who want to act on the plant, where that is asked for."""
+    if arguments.control is None:
+        return None
+    heaviest_kg = machine["estimator.prior.m_t_kg.high"]
+    hello = Hello(arguments.bus.strip(), str(arguments.arm.resolve()), heaviest_kg, arguments.ecu == "spawn")
+    control = Control(arguments.control, hello)
+    if not arguments.quiet:
+        say(f"run.py: the plant takes commands on 127.0.0.1:{control.port}; python tools/live.py {arguments.bus}")
+    return control
 
 
 def main(argv: list[str]) -> int:
@@ -172,6 +211,8 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
         inputs = load_inputs(arguments)
         machine, scenario = inputs.machine, inputs.scenario
         execution.compile_plant(machine, scenario)
+        if arguments.control is not None and not scenario.faults:
+            execution.compile_plant(machine, replace(scenario, faults=(WARM_UP_FAULT,)))
         period_s = execution.PERIOD_US * 1e-6
         try:
             run = session.make_session(
@@ -180,6 +221,7 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
         except ValueError as error:
             raise ConfigError(f"{error} with the supply of {machine.name}") from error
         image = parameter_image(machine)
+        control = open_control(arguments, machine)
         if inputs.plant is not None:
             cleanup.callback(inputs.plant.close)
             inputs.plant.start(run, scenario)
@@ -193,7 +235,7 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
     status, problem = 0, None
     start, wall_s = time.perf_counter(), None
     console = Console(stderr=True)
-    show = console.is_terminal and not arguments.quiet
+    show = console.is_terminal and not arguments.quiet and not arguments.endless
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
         TimeRemainingColumn(), console=console, transient=True, disable=not show,
@@ -206,7 +248,17 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
                 wall_s = execution.in_process(run, image, arguments.scalar, progress, inputs.plant)
             else:
                 pace = (arguments.pace or "realtime") if arguments.ecu == "spawn" else None
-                wall_s = execution.over_bus(run, inputs.address, pace, image, progress, arguments.quiet, inputs.plant)
+                wall_s = execution.over_bus(
+                    run,
+                    inputs.address,
+                    pace,
+                    image,
+                    progress,
+                    arguments.quiet,
+                    inputs.plant,
+                    commands=control,
+                    endless=arguments.endless,
+                )
         except (ConfigError, BusError, bus_run.EcuMissingError) as error:
             status, problem = EXIT_WRONG_USE, str(error)
         except (bus_run.EcuLostError, PlantLostError) as error:
@@ -218,10 +270,13 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
                 "interrupted; the valves are closed, what was recorded is kept",
             )
 
+    if control is not None:
+        control.close()
+        run = control.session or run
     if status == 0:
         problem = execution.outcome(run)
         status = EXIT_FAILED if problem else 0
-    if run.progress.index[session.TICK]:
+    if run.progress.index[session.TICK] and not arguments.endless:
         figures = results.run_of(
             run,
             arguments.controller,
@@ -231,12 +286,14 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
             arguments.bus,
             time.perf_counter() - start if wall_s is None else wall_s,
         )
-        if not write_outputs(arguments, run.record, figures, results.fault_lines(run, scenario.faults)):
+        commands = None if control is None else control.commands
+        faults = results.fault_lines(run, scenario.faults)
+        if not write_outputs(arguments, run.record, figures, faults, commands):
             status = status or EXIT_WRONG_USE
     if problem:
         say(f"run.py: {problem}")
     late = int(run.monitor.whole[session.LATE])
-    if late and not arguments.quiet and not run.errors.frame_loss and not scenario.faults:
+    if late and not arguments.quiet and not run.errors.frame_loss and not run.faulty:
         say(
             f"run.py: note: {late} ticks ended without all sensor frames, because this machine paused the plant for "
             "longer than the ECU waits; the trace differs from an undisturbed run's"

@@ -425,6 +425,24 @@ def make_session(
     )
 
 
+def motion_frames_sent(session: Session) -> int:
+    """How many commands of the master have gone out as scheduled; the next one's counter, modulo 15."""
+    sent = session.schedule.frame_row[: session.progress.index[NEXT_FRAME]]
+    return sum(frame_id(row) == protocol.frame_id("MOTION") for row in sent) % E2E_STATES
+
+
+def rewind(session: Session) -> int:
+    """Begin the record and the noise anew after the prelude, so that a run can go on after its end.
+
+    Nothing of the plant and of the node changes; the scenario's moves and loads are over. How many ticks it was.
+    """
+    ticks = len(session.noise) - session.timeline.motion
+    session.progress.index[TICK] -= ticks
+    session.progress.move[:, 3] = 0.0
+    injection.rewind(session.injection, ticks)
+    return ticks
+
+
 @njit(cache=True)
 def reference_at(start: float, target: float, elapsed: float, total: float) -> float:
     """The move's reference: s(tau) = 35 tau^4 - 84 tau^5 + 70 tau^6 - 20 tau^7."""

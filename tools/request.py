@@ -30,16 +30,14 @@ from sil_plant import session  # noqa: E402
 from sil_plant.buses import BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.diagnosis import REFUSALS  # noqa: E402
-from sil_plant.frames import from_row  # noqa: E402
 from sil_plant.listen import Listener, joinable  # noqa: E402
-from sil_plant.protocol import database  # noqa: E402
+from sil_plant.master import NETWORK, request_frames  # noqa: E402
 from sil_plant.watch import JOINTS, Snapshot, Watch  # noqa: E402
 
 EXIT_REFUSED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 LOOK_S = 0.4  # every page of TIMING comes within it
 ANSWER_S = 2.0
 STEP_S = 0.1
-NETWORK = {"START": (1, "OPERATIONAL"), "STOP": (2, "STOPPED"), "RESET": (129, "PRE_OPERATIONAL")}
 # The modes that show that a request was carried out.
 MODES = {
     "STANDBY": ("STANDBY",),
@@ -78,25 +76,16 @@ def parse_arguments(argv: list[str]) -> argparse.Namespace:
 
 def send(listener: Listener, arguments: argparse.Namespace) -> None:
     """Send the request."""
-    if arguments.request in NETWORK:
-        listener.send(0x000, bytes((NETWORK[arguments.request][0], 0)))
-        return
-    choices = database().get_message_by_name("MOTION").get_signal_by_name("Request").choices
-    code = next(code for code, name in choices.items() if str(name) == arguments.request)
-    # A counter that the last master may have used last is refused once; NONE takes that upon itself.
-    listener.send(*from_row(session.motion_frame(13, 0)))
-    listener.send(
-        *from_row(
-            session.motion_frame(
-                14,
-                code,
-                joint=JOINTS.index(arguments.joint or "swing"),
-                controller=session.CONTROLLERS.index(arguments.controller),
-                target_rad=arguments.target or 0.0,
-                duration_ms=max(1, round(1e3 * (arguments.duration or 0.0))),
-            )
-        )
+    frames = request_frames(
+        arguments.request,
+        13,
+        joint=arguments.joint or "swing",
+        controller=arguments.controller,
+        target_rad=arguments.target or 0.0,
+        duration_s=arguments.duration or 0.0,
     )
+    for frame in frames:
+        listener.send(*frame)
 
 
 def done(state: Snapshot, request: str) -> bool:

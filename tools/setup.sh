@@ -85,6 +85,8 @@ if [ "$purpose" = test ]; then
     fi
     need candump can-utils
     need ip iproute2
+    # the page of tools/live.py is tested in a browser; Ubuntu's package of this name only leads to a snap
+    have chromium || have chromium-browser || have google-chrome || optional+=(chromium)
     need arm-none-eabi-gcc gcc-arm-none-eabi
     need qemu-system-arm qemu-system-arm
     # A Linux kernel as a program, with the vcan driver; exists for PCs only.
@@ -131,7 +133,7 @@ and see what it says"
 fi
 if [ ${#optional[@]} -gt 0 ]; then
     if [ $can_install = no ] || ! apt install -y --no-install-recommends "${optional[@]}"; then
-        say "without ${optional[*]}: this kernel has no vcan, so the tests on a real CAN interface are skipped; to have them:"
+        say "without ${optional[*]}: the tests that need them (a CAN interface, a browser) are skipped; to have them:"
         say "    sudo apt-get install --no-install-recommends ${optional[*]}"
         without=${optional[*]}
     fi
