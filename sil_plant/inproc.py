@@ -6,9 +6,10 @@ import ctypes
 from pathlib import Path
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.types import WrapperAddressProtocol
 
+from sil_plant.compiled import inlined
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.frames import FRAME_BYTES, frame_id
 from sil_plant.protocol import SYNC_ID
@@ -131,7 +132,7 @@ def _load(path: Path) -> ctypes.CDLL:
     return library
 
 
-@njit(cache=True)
+@inlined
 def closed_loop(
     session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
 ) -> int:
@@ -152,7 +153,7 @@ def closed_loop(
     return ticks
 
 
-@njit(cache=True)
+@inlined
 def closed_loop_with_faults(
     session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
 ) -> int:

@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sil_plant import frames, protocol
+from sil_plant.compiled import inlined
 from sil_plant.frames import E2E_STATES, get, intact, protect, put, quantise, write_header
 from sil_plant.machine import Machine
 from sil_plant.plant import P_SWING, STATES, XV, PlantParameters, integrate
@@ -123,7 +123,7 @@ def node_errors(machine: Machine) -> NodeErrors:
     )
 
 
-@njit(cache=True)
+@inlined
 def node_heartbeat(layout: NodeLayout, row: np.ndarray) -> None:
     """Make a row the node's heartbeat."""
     write_header(row, layout.heartbeat_id, 1)
@@ -153,7 +153,7 @@ def make_node(y: np.ndarray, load_kg: float) -> Node:
     )
 
 
-@njit(cache=True)
+@inlined
 def follow(node: Node, hysteresis: float) -> None:
     """Let the spools follow the set-points in effect, with play."""
     for i in range(2):
@@ -161,7 +161,7 @@ def follow(node: Node, hysteresis: float) -> None:
         node.u[2, i] = min(max(node.u[2, i], low), high)
 
 
-@njit(cache=True)
+@inlined
 def advance_one_period(
     node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
 ) -> None:
@@ -192,7 +192,7 @@ def advance_one_period(
     integrate(node.y, node.u[2], node.load[0], plant, timing.period_s - delay_s, node.scratch)
 
 
-@njit(cache=True)
+@inlined
 def node_sync(
     node: Node,
     plant: PlantParameters,
@@ -264,7 +264,7 @@ def node_sync(
     return rows
 
 
-@njit(cache=True)
+@inlined
 def node_frame(node: Node, layout: NodeLayout, row: np.ndarray) -> None:
     """Take a frame from the bus: valve commands count, all others are not for the node."""
     if frames.frame_id(row) != layout.valves_id:

@@ -18,8 +18,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sil_plant.compiled import inlined
 from sil_plant.machine import JOINT_NAMES, Machine
 
 STATES = 12
@@ -129,7 +129,7 @@ def plant_parameters(machine: Machine) -> PlantParameters:
     )
 
 
-@njit(cache=True, inline="always")
+@inlined
 def signed_root(x: float) -> float:
     """Square root of a pressure drop, odd: flow turns round when the drop does."""
     size = abs(x)
@@ -139,7 +139,7 @@ def signed_root(x: float) -> float:
     return math.sqrt(_ROOT_BLEND_PA) * ratio * (1.25 - 0.25 * ratio * ratio)
 
 
-@njit(cache=True, inline="always")
+@inlined
 def stop_torque(q: float, w: float, i: int, p: PlantParameters) -> float:
     """Torque of the stops of joint ``i``, N m; they push, they never hold."""
     lever_squared = 1.0 / (p.lever_inverse[i] * p.lever_inverse[i])
@@ -151,7 +151,7 @@ def stop_torque(q: float, w: float, i: int, p: PlantParameters) -> float:
     return 0.0
 
 
-@njit(cache=True, inline="always")
+@inlined
 def bulk_modulus(pressure: float, p: PlantParameters) -> float:
     """Bulk modulus, Pa: constant, or falling towards low pressure where air is dissolved in the oil."""
     if p.air_bulk_low <= 0.0:
@@ -160,7 +160,7 @@ def bulk_modulus(pressure: float, p: PlantParameters) -> float:
     return p.air_bulk_low + (p.air_bulk_high - p.air_bulk_low) * share
 
 
-@njit(cache=True, inline="always")
+@inlined
 def friction_torque(w: float, lever: float, i: int, p: PlantParameters) -> float:
     """Friction of joint ``i`` at rate ``w``, N m: viscous, Coulomb, and a Stribeck peak at low speed."""
     ratio = lever * p.lever_inverse[i] if p.friction_at_cylinder > 0.5 else 1.0
@@ -172,7 +172,7 @@ def friction_torque(w: float, lever: float, i: int, p: PlantParameters) -> float
     return ratio * (ratio * p.fv[i] * w + coulomb * sign)
 
 
-@njit(cache=True)
+@inlined
 def derivative(y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters, dy: np.ndarray) -> None:
     """Right-hand side of the plant.
 
@@ -233,7 +233,7 @@ def derivative(y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters,
     dy[3] = (torque_2 + 0.5 * h * w1 * w1 - p.g * p.L2 * c * (0.5 * p.m2 + load_kg)) / h22
 
 
-@njit(cache=True)
+@inlined
 def integrate(
     y: np.ndarray, u: np.ndarray, load_kg: float, p: PlantParameters, duration_s: float, scratch: np.ndarray
 ) -> None:
