@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from sil_plant import protocol
 from sil_plant.compiled import inlined
@@ -531,13 +532,13 @@ def disturb_answer(injection: Injection, tick: int, rows: int, out: np.ndarray) 
     return foreign_frames(injection, tick, 1, out, arrived)
 
 
-@inlined
+@njit(inline="always")  # a view cannot be returned otherwise without counting references
 def fresh(injection: Injection) -> np.ndarray:
     """Rows for the frames of this tick, before the faults."""
     return injection.row[_FRESH:_TO_NODE]
 
 
-@inlined
+@njit(inline="always")  # a view cannot be returned otherwise without counting references
 def to_node(injection: Injection) -> np.ndarray:
     """Rows for the valve frames that reach the node, after the faults."""
     return injection.row[_TO_NODE:]
