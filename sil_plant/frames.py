@@ -57,12 +57,15 @@ def write_header(row: np.ndarray, can_id: int, length: int) -> None:
 @inlined
 def put(row: np.ndarray, start: int, length: int, raw: int) -> None:
     """Write a little-endian bit field; ``raw`` may be negative (two's complement)."""
-    for k in range(length):
-        bit = start + k
-        if (raw >> k) & 1:
-            row[DATA + (bit >> 3)] |= np.uint8(1 << (bit & 7))
-        else:
-            row[DATA + (bit >> 3)] &= np.uint8(0xFF ^ (1 << (bit & 7)))
+    bit, taken = start, 0
+    while taken < length:
+        offset = bit & 7
+        take = min(8 - offset, length - taken)
+        mask = ((1 << take) - 1) << offset
+        at = DATA + (bit >> 3)
+        row[at] = (int(row[at]) & (0xFF ^ mask)) | (((raw >> taken) << offset) & mask)
+        bit += take
+        taken += take
 
 
 @inlined

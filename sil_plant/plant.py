@@ -527,7 +527,7 @@ def nearest_to_zero(a: float, change: float) -> float:
 def fastest_rate(
     a: Stage, k: Stage, spools: tuple[float, float], pose: Pose, h: float, load_kg: float, p: PlantParameters
 ) -> float:
-    """How fast, 1/s, the fastest of what may be stiff decays within the next ``h``: friction's bend, valves' ports.
+    """How fast, 1/s, the fastest of friction's bend, open ports' pressures and their drops changes in the next ``h``.
 
     Parameters
     ----------
@@ -564,7 +564,10 @@ def fastest_rate(
         out, out_rate = (annulus[i], annulus_rate[i]) if spools[i] >= 0.0 else (bore[i], bore_rate[i])
         drop = min(nearest_to_zero(p.p_supply - into, -h * into_rate), nearest_to_zero(out - p.p_tank, h * out_rate))
         port = stiffest * p.kv[i] * abs(spools[i]) / (2.0 * volume)
-        fastest = max(fastest, port / math.sqrt(max(drop, 0.64 * _ROOT_BLEND_PA)))
+        drop = max(drop, 0.64 * _ROOT_BLEND_PA)
+        fastest = max(fastest, port / math.sqrt(drop))
+        if abs(spools[i]) > p.overlap[i]:  # the root of a pressure drop that changes by itself is no polynomial
+            fastest = max(fastest, max(abs(into_rate), abs(out_rate)) / drop)
     return fastest
 
 
