@@ -9,7 +9,7 @@ COMPILE_PLANT = $(PYTHON) sil_plant/run.py --bus inproc --duration 0.01 --quiet 
 C_FILES = find firmware tests/unit tests/fuzz tools -name '*.[ch]' -not -path '*/generated/*'
 
 .DEFAULT_GOAL := help
-.PHONY: help setup firmware images fmu budget demo paper campaign test faults coverage fuzz fuzz-corpus lint format generate clean
+.PHONY: help setup firmware images fmu budget bench demo paper campaign test faults coverage fuzz fuzz-corpus lint format generate clean
 
 help: ## list the targets
 	@echo "DIARC ECU: make TARGET"
@@ -38,6 +38,11 @@ budget: ## flash, RAM, worst-case stack and instructions a tick of both images, 
 	@tools/setup.sh test
 	@$(MAKE) firmware
 	@$(PYTHON) tools/budget.py
+
+bench: ## how fast the closed loop is, beside MuJoCo, SciPy and numpy: build/bench.json and build/bench.png
+	@tools/setup.sh test
+	@$(MAKE) firmware
+	@$(PYTHON) tools/bench.py
 
 demo: ## the ECU moves a simulated arm; needs no CAN hardware
 	@tools/setup.sh demo

@@ -82,7 +82,7 @@ def compile_plant(machine: Machine, scenario: Scenario) -> None:
 
     compiled = "on_sync_with_faults" if scenario.faults else "on_sync_plain"
     if not any(Path(config.CACHE_DIR).glob(f"**/session.{compiled}*.nbi")):
-        say("compiling the plant, once after installation (about 20 s) ...")
+        say("compiling the plant, once after installation (up to a minute) ...")
     short = with_load(replace(scenario, duration_s=0.01), 0.0)
     try:
         warm = session.make_session(machine, short, "diarc", 0, PERIOD_US * 1e-6)

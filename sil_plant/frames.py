@@ -7,7 +7,8 @@ little-endian), length, eight data bytes, padding. Bit layouts come from the DBC
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from sil_plant.compiled import inlined
 
 FRAME_BYTES = 16
 DATA = 5  # first data byte in a row
@@ -27,7 +28,7 @@ def _crc_table() -> np.ndarray:
 _CRC = _crc_table()
 
 
-@njit(cache=True)
+@inlined
 def e2e_crc(can_id: int, row: np.ndarray) -> int:
     """CRC-8 of E2E profile 1 (mode BOTH, data id = identifier) over data bytes 1..7 of a frame row."""
     crc = _CRC[can_id & 0xFF]
@@ -37,13 +38,13 @@ def e2e_crc(can_id: int, row: np.ndarray) -> int:
     return crc
 
 
-@njit(cache=True)
+@inlined
 def frame_id(row: np.ndarray) -> int:
     """Identifier of a frame row."""
     return int(row[0]) | int(row[1]) << 8 | int(row[2]) << 16 | int(row[3]) << 24
 
 
-@njit(cache=True)
+@inlined
 def write_header(row: np.ndarray, can_id: int, length: int) -> None:
     """Make a row an empty frame."""
     for k in range(FRAME_BYTES):
@@ -53,18 +54,21 @@ def write_header(row: np.ndarray, can_id: int, length: int) -> None:
     row[4] = length
 
 
-@njit(cache=True)
+@inlined
 def put(row: np.ndarray, start: int, length: int, raw: int) -> None:
     """Write a little-endian bit field; ``raw`` may be negative (two's complement)."""
-    for k in range(length):
-        bit = start + k
-        if (raw >> k) & 1:
-            row[DATA + (bit >> 3)] |= np.uint8(1 << (bit & 7))
-        else:
-            row[DATA + (bit >> 3)] &= np.uint8(0xFF ^ (1 << (bit & 7)))
+    bit, taken = start, 0
+    while taken < length:
+        offset = bit & 7
+        take = min(8 - offset, length - taken)
+        mask = ((1 << take) - 1) << offset
+        at = DATA + (bit >> 3)
+        row[at] = (int(row[at]) & (0xFF ^ mask)) | (((raw >> taken) << offset) & mask)
+        bit += take
+        taken += take
 
 
-@njit(cache=True)
+@inlined
 def get(row: np.ndarray, start: int, length: int, signed: int) -> int:
     """Read a little-endian bit field."""
     raw = 0
@@ -80,14 +84,14 @@ def get(row: np.ndarray, start: int, length: int, signed: int) -> int:
     return raw
 
 
-@njit(cache=True)
+@inlined
 def protect(row: np.ndarray, counter: int) -> None:
     """Put E2E counter and CRC into a frame whose other bytes are final."""
     row[DATA + 1] = (row[DATA + 1] & 0xF0) | counter
     row[DATA] = e2e_crc(frame_id(row), row)
 
 
-@njit(cache=True)
+@inlined
 def intact(row: np.ndarray) -> bool:
     """True for a frame of 8 bytes whose CRC is right."""
     return row[4] == 8 and e2e_crc(frame_id(row), row) == row[DATA]
@@ -104,7 +108,7 @@ def intact_rows(rows: np.ndarray) -> np.ndarray:
     return (rows[:, 4] == 8) & (crc == rows[:, DATA])
 
 
-@njit(cache=True)
+@inlined
 def quantise(value: float, step: float, low: int, high: int) -> int:
     """Raw integer of a physical value: round half away from zero, saturate."""
     scaled = value / step

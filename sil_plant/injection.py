@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from sil_plant import protocol
+from sil_plant.compiled import inlined
 from sil_plant.faults import ALL_SENSOR_FRAMES, FRAMES, KINDS, PRIORITIES, SENSORS, Fault
 from sil_plant.frames import DATA, E2E_STATES, FRAME_BYTES, frame_id, get, protect, put, quantise, write_header
 from sil_plant.io_node import NodeTiming
@@ -239,7 +240,7 @@ def rewind(injection: Injection, ticks: int) -> None:
 # ---- what is active ------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@inlined
 def draw(seed: int, fault: int, tick: int, place: int) -> float:
     """A number in 0..1, equally likely, from where it is asked for (splitmix64)."""
     z = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(fault) * np.uint64(0xA24BAED4963EE407)
@@ -250,13 +251,13 @@ def draw(seed: int, fault: int, tick: int, place: int) -> float:
     return float(z >> np.uint64(11)) / 9007199254740992.0
 
 
-@njit(cache=True)
+@inlined
 def under_way(injection: Injection, fault: int, tick: int) -> bool:
     """True while a fault lasts."""
     return injection.plan[fault, FIRST] <= tick < injection.plan[fault, LAST]
 
 
-@njit(cache=True)
+@inlined
 def any_of(injection: Injection, kind: int, tick: int) -> bool:
     """True while a fault of this kind lasts."""
     for n in range(injection.plan.shape[0]):
@@ -265,7 +266,7 @@ def any_of(injection: Injection, kind: int, tick: int) -> bool:
     return False
 
 
-@njit(cache=True)
+@inlined
 def starved(injection: Injection, tick: int) -> bool:
     """True while foreign frames of higher priority leave not even SYNC a place."""
     for n in range(injection.plan.shape[0]):
@@ -279,13 +280,13 @@ def starved(injection: Injection, tick: int) -> bool:
     return False
 
 
-@njit(cache=True)
+@inlined
 def nothing_from_ecu(injection: Injection, tick: int) -> bool:
     """True while no frame of the ECU reaches anybody."""
     return any_of(injection, BUS_OFF, tick) or starved(injection, tick)
 
 
-@njit(cache=True)
+@inlined
 def transmit_room(injection: Injection, tick: int, most: int) -> int:
     """Frames that the ECU's driver takes in this tick, at most ``most``."""
     if nothing_from_ecu(injection, tick):
@@ -297,7 +298,7 @@ def transmit_room(injection: Injection, tick: int, most: int) -> int:
     return room
 
 
-@njit(cache=True)
+@inlined
 def sync_reaches_node(injection: Injection, tick: int) -> bool:
     """False when the SYNC of this tick gets lost, or nobody is there to hear it."""
     if any_of(injection, NODE_KILLED, tick) or nothing_from_ecu(injection, tick):
@@ -319,7 +320,7 @@ _P_SUPPLY = PlantParameters._fields.index("p_supply")
 _AFTER_P_SUPPLY = _P_SUPPLY + 1
 
 
-@njit(cache=True)
+@inlined
 def plant_now(injection: Injection, plant: PlantParameters, tick: int, period_s: float) -> PlantParameters:
     """The plant with the supply pressure it has in this tick; to be called once a tick."""
     share, goal, time_s = injection.number[SUPPLY_SHARE], 1.0, 0.0
@@ -333,7 +334,7 @@ def plant_now(injection: Injection, plant: PlantParameters, tick: int, period_s:
     return PlantParameters(*(plant[:_P_SUPPLY] + (plant.p_supply * share,) + plant[_AFTER_P_SUPPLY:]))  # noqa: RUF005
 
 
-@njit(cache=True)
+@inlined
 def load_now(injection: Injection, load_kg: float, tick: int) -> float:
     """The load in this tick."""
     for n in range(injection.plan.shape[0]):
@@ -342,7 +343,7 @@ def load_now(injection: Injection, load_kg: float, tick: int) -> float:
     return load_kg
 
 
-@njit(cache=True)
+@inlined
 def timing_now(injection: Injection, timing: NodeTiming, tick: int) -> NodeTiming:
     """Times of the node from the last SYNC to this one; to be called once a tick."""
     jitter_s = 0.0
@@ -359,7 +360,7 @@ def timing_now(injection: Injection, timing: NodeTiming, tick: int) -> NodeTimin
 # ---- sensors -------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@inlined
 def disturb_sensors(injection: Injection, tick: int, row: np.ndarray) -> None:
     """What is wrong with the sensors in a frame that the node has packed; its protection stays right."""
     can_id = frame_id(row)
@@ -398,14 +399,14 @@ def disturb_sensors(injection: Injection, tick: int, row: np.ndarray) -> None:
 # ---- frames --------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@inlined
 def copy_row(source: np.ndarray, target: np.ndarray) -> None:
     """Copy a frame."""
     for k in range(FRAME_BYTES):
         target[k] = source[k]
 
 
-@njit(cache=True)
+@inlined
 def hold(injection: Injection, row: np.ndarray, due: int, route: int) -> None:
     """Keep a frame until it is due."""
     for slot in range(HELD_MOST):
@@ -416,7 +417,7 @@ def hold(injection: Injection, row: np.ndarray, due: int, route: int) -> None:
             return
 
 
-@njit(cache=True)
+@inlined
 def release(injection: Injection, tick: int, route: int, out: np.ndarray, rows: int) -> int:
     """Append the frames that are due on a route to ``out``; the rows in it then."""
     for slot in range(HELD_MOST):
@@ -427,7 +428,7 @@ def release(injection: Injection, tick: int, route: int, out: np.ndarray, rows: 
     return rows
 
 
-@njit(cache=True)
+@inlined
 def send_disturbed(injection: Injection, tick: int, row: np.ndarray, out: np.ndarray, rows: int) -> int:
     """Append to ``out`` what arrives of a frame; the rows in it then. Changes ``row``."""
     which = -1
@@ -477,7 +478,7 @@ def send_disturbed(injection: Injection, tick: int, row: np.ndarray, out: np.nda
     return rows
 
 
-@njit(cache=True)
+@inlined
 def foreign_frames(injection: Injection, tick: int, priority: int, out: np.ndarray, rows: int) -> int:
     """Append the foreign frames of this tick, of higher (0) or lower (1) priority than ours; the rows then.
 
@@ -514,7 +515,7 @@ def foreign_frames(injection: Injection, tick: int, priority: int, out: np.ndarr
     return rows
 
 
-@njit(cache=True)
+@inlined
 def write_hash(row: np.ndarray, value: int) -> None:
     """Make a row the master's SDO write of its DBC hash: an expedited download of four bytes."""
     write_header(row, _SDO_TO_ECU, 8)
@@ -530,7 +531,7 @@ def hash_frame(value: int) -> np.ndarray:
     return row
 
 
-@njit(cache=True)
+@inlined
 def wrong_hash_written(injection: Injection) -> bool:
     """True when a fault of this run tells the ECU another DBC's hash: to recover, it must be told the right one."""
     for n in range(injection.plan.shape[0]):
@@ -539,7 +540,7 @@ def wrong_hash_written(injection: Injection) -> bool:
     return False
 
 
-@njit(cache=True)
+@inlined
 def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np.ndarray, rows: int) -> int:
     """Append what others send in this tick that should not: network management, a second ECU; the rows then."""
     for n in range(injection.plan.shape[0]):
@@ -567,7 +568,7 @@ def frames_of_others(injection: Injection, tick: int, sync_counter: int, out: np
     return rows
 
 
-@njit(cache=True)
+@inlined
 def disturb_answer(injection: Injection, tick: int, rows: int, out: np.ndarray) -> int:
     """Write to ``out`` what reaches the ECU of the ``rows`` frames in :func:`fresh`; the rows in it."""
     injection.number[ROOM_BITS] = injection.bits_per_tick - _SYNC_BITS
@@ -585,19 +586,19 @@ def disturb_answer(injection: Injection, tick: int, rows: int, out: np.ndarray) 
     return foreign_frames(injection, tick, 1, out, arrived)
 
 
-@njit(cache=True)
+@njit(inline="always")  # a view cannot be returned otherwise without counting references
 def fresh(injection: Injection) -> np.ndarray:
     """Rows for the frames of this tick, before the faults."""
     return injection.row[_FRESH:_TO_NODE]
 
 
-@njit(cache=True)
+@njit(inline="always")  # a view cannot be returned otherwise without counting references
 def to_node(injection: Injection) -> np.ndarray:
     """Rows for the valve frames that reach the node, after the faults."""
     return injection.row[_TO_NODE:]
 
 
-@njit(cache=True)
+@inlined
 def disturb_valves(injection: Injection, tick: int, row: np.ndarray) -> int:
     """Write to :func:`to_node` what reaches the node of a valve frame; the rows in it."""
     if any_of(injection, NODE_KILLED, tick):
@@ -610,19 +611,19 @@ def disturb_valves(injection: Injection, tick: int, row: np.ndarray) -> int:
     return send_disturbed(injection, tick, injection.row[_FRESH], to_node(injection), 0)
 
 
-@njit(cache=True)
+@inlined
 def late_valves(injection: Injection, tick: int) -> int:
     """Write to :func:`to_node` the valve frames held until this tick; the rows in it."""
     return release(injection, tick, TO_NODE, to_node(injection), 0)
 
 
-@njit(cache=True)
+@inlined
 def is_motion(injection: Injection, row: np.ndarray) -> bool:
     """True for a command of the master."""
     return frame_id(row) == injection.table[MOTION, ID]
 
 
-@njit(cache=True)
+@inlined
 def request_of(injection: Injection, row: np.ndarray) -> int:
     """What a command of the master asks for."""
     return get(row, injection.table[MOTION_REQUEST, START], injection.table[MOTION_REQUEST, LENGTH], 0)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numba.experimental.function_type  # noqa: F401  without it numba does not know _CFunction before its first compiling
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.types import WrapperAddressProtocol
 
+from sil_plant.compiled import inlined
 from sil_plant.config import ROOT, ConfigError
 from sil_plant.external_plant import ExternalPlant
 from sil_plant.frames import DATA, FRAME_BYTES, frame_id
@@ -146,7 +147,7 @@ def _load(path: Path) -> ctypes.CDLL:
     return library
 
 
-@njit(cache=True)
+@inlined
 def closed_loop(
     session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
 ) -> int:
@@ -167,7 +168,7 @@ def closed_loop(
     return ticks
 
 
-@njit(cache=True)
+@inlined
 def closed_loop_with_faults(
     session: Session, begin: _CFunction, end: _CFunction, ecu: int, ticks: int, rx: np.ndarray, tx: np.ndarray
 ) -> int:

@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sil_plant import frames, protocol
+from sil_plant.compiled import inlined
 from sil_plant.frames import E2E_STATES, get, intact, protect, put, quantise, write_header
 from sil_plant.machine import Machine
 from sil_plant.plant import P_SWING, STATES, XV, PlantParameters, integrate
@@ -123,7 +123,7 @@ def node_errors(machine: Machine) -> NodeErrors:
     )
 
 
-@njit(cache=True)
+@inlined
 def node_heartbeat(layout: NodeLayout, row: np.ndarray) -> None:
     """Make a row the node's heartbeat."""
     write_header(row, layout.heartbeat_id, 1)
@@ -153,7 +153,7 @@ def make_node(y: np.ndarray, load_kg: float) -> Node:
     )
 
 
-@njit(cache=True)
+@inlined
 def follow(node: Node, hysteresis: float) -> None:
     """Let the spools follow the set-points in effect, with play."""
     for i in range(2):
@@ -161,13 +161,13 @@ def follow(node: Node, hysteresis: float) -> None:
         node.u[2, i] = min(max(node.u[2, i], low), high)
 
 
-@njit(cache=True)
+@inlined
 def command_delay(timing: NodeTiming, errors: NodeErrors, jitter: float) -> float:
     """From SYNC until a command takes effect, s; ``jitter`` -1..1 says how far it is off in this period."""
     return min(max(timing.delay_s + jitter * errors.jitter_s, 0.0), timing.period_s)
 
 
-@njit(cache=True)
+@inlined
 def take_command(node: Node, timing: NodeTiming, errors: NodeErrors) -> None:
     """Put the command that waits into effect; without one for too long, close the valves."""
     count = node.count
@@ -185,7 +185,7 @@ def take_command(node: Node, timing: NodeTiming, errors: NodeErrors) -> None:
     follow(node, errors.hysteresis)
 
 
-@njit(cache=True)
+@inlined
 def advance_one_period(
     node: Node, plant: PlantParameters, timing: NodeTiming, errors: NodeErrors, jitter: float
 ) -> None:
@@ -206,7 +206,7 @@ def advance_one_period(
     integrate(node.y, node.u[2], node.load[0], plant, timing.period_s - delay_s, node.scratch)
 
 
-@njit(cache=True)
+@inlined
 def node_sync(
     node: Node,
     plant: PlantParameters,
@@ -278,7 +278,7 @@ def node_sync(
     return rows
 
 
-@njit(cache=True)
+@inlined
 def node_frame(node: Node, layout: NodeLayout, row: np.ndarray) -> None:
     """Take a frame from the bus: valve commands count, all others are not for the node."""
     if frames.frame_id(row) != layout.valves_id:

@@ -10,9 +10,9 @@ import hashlib
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from sil_plant import injection, protocol
+from sil_plant.compiled import inlined
 from sil_plant.frames import DATA, E2E_STATES, FRAME_BYTES, frame_id, get, intact, protect, put, quantise, to_row
 from sil_plant.injection import Injection
 from sil_plant.io_node import (
@@ -443,7 +443,7 @@ def rewind(session: Session) -> int:
     return ticks
 
 
-@njit(cache=True)
+@inlined
 def reference_at(start: float, target: float, elapsed: float, total: float) -> float:
     """The move's reference: s(tau) = 35 tau^4 - 84 tau^5 + 70 tau^6 - 20 tau^7."""
     if total <= 0.0:
@@ -454,7 +454,7 @@ def reference_at(start: float, target: float, elapsed: float, total: float) -> f
     return start + (target - start) * tau**4 * (35.0 + tau * (-84.0 + tau * (70.0 - 20.0 * tau)))
 
 
-@njit(cache=True)
+@inlined
 def update_references(session: Session, tick: int) -> None:
     """Start the moves due at this tick and record the references."""
     schedule, index, move = session.schedule, session.progress.index, session.progress.move
@@ -482,7 +482,7 @@ def update_references(session: Session, tick: int) -> None:
             )
 
 
-@njit(cache=True)
+@inlined
 def load_due(session: Session, tick: int) -> None:
     """Change the load where the scenario says so."""
     schedule, index = session.schedule, session.progress.index
@@ -491,7 +491,7 @@ def load_due(session: Session, tick: int) -> None:
         index[NEXT_LOAD] += 1
 
 
-@njit(cache=True)
+@inlined
 def master_frames(session: Session, tick: int, out: np.ndarray) -> int:
     """Write the master's commands of this tick to ``out``; how many."""
     schedule, index = session.schedule, session.progress.index
@@ -508,7 +508,7 @@ def master_frames(session: Session, tick: int, out: np.ndarray) -> int:
     return rows
 
 
-@njit(cache=True)
+@inlined
 def record_tick(session: Session, tick: int) -> None:
     """The row of this tick."""
     record, node, monitor = session.record, session.node, session.monitor
@@ -544,7 +544,7 @@ def on_frame(session: Session, row: np.ndarray) -> None:
     (on_frame_with_faults if session.faulty else on_frame_plain)(session, row)
 
 
-@njit(cache=True)
+@inlined
 def on_sync_plain(session: Session, sync_counter: int, out: np.ndarray) -> int:
     """As :func:`on_sync`, for compiled code and a session without faults."""
     tick = session.progress.index[TICK]
@@ -559,7 +559,7 @@ def on_sync_plain(session: Session, sync_counter: int, out: np.ndarray) -> int:
     return rows
 
 
-@njit(cache=True)
+@inlined
 def answer(
     session: Session, plant: PlantParameters, timing: NodeTiming, tick: int, sync_counter: int, out: np.ndarray
 ) -> int:
@@ -584,7 +584,7 @@ def answer(
 # ---- with faults ---------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@inlined
 def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) -> int:
     """As :func:`on_sync`, with the faults of the scenario."""
     tick = session.progress.index[TICK]
@@ -616,7 +616,7 @@ def on_sync_with_faults(session: Session, sync_counter: int, out: np.ndarray) ->
     return arrived
 
 
-@njit(cache=True)
+@inlined
 def without_sync(session: Session, out: np.ndarray) -> int:
     """A tick in which no SYNC reaches the node: it goes on by its own clock and says nothing.
 
@@ -654,7 +654,7 @@ def without_sync(session: Session, out: np.ndarray) -> int:
     return arrived
 
 
-@njit(cache=True)
+@inlined
 def commands(session: Session, tick: int, out: np.ndarray) -> int:
     """The master's frames of this tick: as scheduled, without moves the ECU would refuse, and those that recover."""
     mode = session.monitor.whole[MODE]
@@ -683,7 +683,7 @@ def commands(session: Session, tick: int, out: np.ndarray) -> int:
     return rows
 
 
-@njit(cache=True)
+@inlined
 def recovery_frame(session: Session, mode: int, out: np.ndarray, rows: int) -> int:
     """Append the documented procedure's next request for an ECU in this mode; the rows then."""
     if mode == MODE_INIT or session.monitor.whole[NMT_STATE] in (NMT_STOPPED, NMT_PRE_OPERATIONAL):
@@ -700,19 +700,19 @@ def recovery_frame(session: Session, mode: int, out: np.ndarray, rows: int) -> i
     return rows + 1
 
 
-@njit(cache=True)
+@inlined
 def drives(mode: int) -> bool:
     """Modes in which the ECU takes moves."""
     return mode == MODE_RUN or mode == MODE_COMMISSION
 
 
-@njit(cache=True)
+@inlined
 def ecu_is_dead(session: Session) -> bool:
     """True in a tick in which the ECU is killed."""
     return injection.any_of(session.injection, injection.ECU_KILLED, session.progress.index[TICK])
 
 
-@njit(cache=True)
+@inlined
 def transmit_room(session: Session, most: int) -> int:
     """Frames that the ECU's driver takes in the tick that begins, at most ``most``."""
     return injection.transmit_room(session.injection, session.progress.index[TICK], most)
@@ -724,7 +724,7 @@ def restarts(session: Session) -> list[int]:
     return sorted(set(plan[plan[:, injection.KIND] == injection.ECU_KILLED, injection.LAST].tolist()))
 
 
-@njit(cache=True)
+@inlined
 def hear_mode(session: Session, row: np.ndarray) -> None:
     """The mode on an intact valve frame."""
     whole = session.monitor.whole
@@ -733,7 +733,7 @@ def hear_mode(session: Session, row: np.ndarray) -> None:
         whole[FAULTED] = 1
 
 
-@njit(cache=True)
+@inlined
 def on_frame_plain(session: Session, row: np.ndarray) -> None:
     """As :func:`on_frame`, for compiled code and a session without faults."""
     if frame_id(row) != session.monitor_layout.valves_id:
@@ -746,7 +746,7 @@ def on_frame_plain(session: Session, row: np.ndarray) -> None:
         hear_mode(session, row)
 
 
-@njit(cache=True)
+@inlined
 def on_frame_with_faults(session: Session, row: np.ndarray) -> None:
     """As :func:`on_frame`, with what the bus and the faults leave of the frame; the record has it as it was sent."""
     tick = max(session.progress.index[TICK] - 1, 0)
@@ -771,7 +771,7 @@ def on_frame_with_faults(session: Session, row: np.ndarray) -> None:
             whole[OUTSIDE] += 1
 
 
-@njit(cache=True)
+@inlined
 def hear(session: Session, row: np.ndarray) -> None:
     """What the monitor learns from a frame of the ECU."""
     layout, whole = session.monitor_layout, session.monitor.whole
@@ -818,7 +818,7 @@ def hear(session: Session, row: np.ndarray) -> None:
                 whole[REBOOTS] += 1
 
 
-@njit(cache=True)
+@inlined
 def take_emergency(session: Session, row: np.ndarray) -> None:
     """An emergency of the ECU; error code 0 says that it is over."""
     f, whole = session.monitor_layout.emergency, session.monitor.whole

@@ -103,6 +103,18 @@ def comparison_table() -> str:
     return "\n".join(rows)
 
 
+def speed_table() -> str:
+    """How fast the closed loop is, from the last `make bench`."""
+    from tools.bench import readme_table
+
+    path = ROOT / "build" / "bench.json"
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError("build/bench.json is not there yet: make bench") from error
+    return readme_table(result)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "frames": frames_table,
     "example": example_run,

@@ -48,7 +48,7 @@ def one_step(y: Array, u: Array, load_kg: float, parameters: PlantParameters, st
     """The state one step of the plant's integrator later."""
     assert step_s <= LONGEST_STEP_S, "the integrator would take more than one step"
     after = y.copy()
-    integrate(after, u, load_kg, parameters, step_s, np.empty((5, STATES)))
+    integrate(after, u, load_kg, parameters, step_s, np.zeros((5, STATES)))
     return after
 
 
