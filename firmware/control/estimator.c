@@ -21,7 +21,8 @@ SELDOM struct estimator_constants estimator_constants(const struct estimator_par
     const scalar window_s = mul(dt_s, SCALAR(ROW_TURNS));
     constants.filter = quot(window_s, parameters->filter_time + window_s);
     constants.filter_rate = gain_quot(constants.filter, window_s);
-    constants.ramp_step = quot(dt_s, parameters->filter_time + dt_s);
+    constants.tick_filter = quot(dt_s, parameters->filter_time + dt_s);
+    constants.tick_filter_rate = gain_quot(constants.tick_filter, dt_s);
     constants.per_tick = gain_quot(SCALAR(1), dt_s);
     constants.per_window = gain_quot(SCALAR(1), window_s);
     constants.per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
@@ -139,14 +140,13 @@ static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
     filter->second += mul(pole_step, filter->first - filter->second);
 }
 
-/* The same of step / dt + x. */
-static void low_pass_rate(struct two_poles *filter, const struct estimator_constants *constants, scalar step,
-                          scalar x)
+/* The same of step / T + x, with pole_rate = pole_step / T. */
+static void low_pass_rate(struct two_poles *filter, scalar pole_step, gain pole_rate, scalar step, scalar x)
 {
-    filter->step += step - mul(constants->filter, filter->step);
-    filter->first += mul(constants->filter, x - filter->first);
-    const scalar first = filter->first + amp(constants->filter_rate, filter->step);
-    filter->second += mul(constants->filter, first - filter->second);
+    filter->step += step - mul(pole_step, filter->step);
+    filter->first += mul(pole_step, x - filter->first);
+    const scalar first = filter->first + amp(pole_rate, filter->step);
+    filter->second += mul(pole_step, first - filter->second);
 }
 
 /* 0 at rest, 1 from twice the gate's rate on; after a start of the filters it opens with the ramp. */
@@ -216,11 +216,11 @@ OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estima
         const scalar g = m->gate;
         low_pass(&m->open, constants->filter, g);
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-            low_pass_rate(&m->column[k], constants, mul(g, momentum.phi[k] - before->phi[k]),
-                          mul(g, force.phi[k]));
+            low_pass_rate(&m->column[k], constants->filter, constants->filter_rate,
+                          mul(g, momentum.phi[k] - before->phi[k]), mul(g, force.phi[k]));
         }
-        low_pass_rate(&m->column[ROW_COLUMNS], constants, mul(g, momentum.known - before->known),
-                      mul(g, force.known - torque));
+        low_pass_rate(&m->column[ROW_COLUMNS], constants->filter, constants->filter_rate,
+                      mul(g, momentum.known - before->known), mul(g, force.known - torque));
     }
     m->momentum = momentum;
     m->w[SWING] = w[SWING];
@@ -232,39 +232,39 @@ OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estima
     m->gate = gate(e, parameters, constants, now->reference_w[i]);
 }
 
-/* Flow balance of joint i over the last window, gated and filtered: Eq 6 in the form of Eq 25. */
+/* Flow balance of joint i over the last tick, gated and filtered: Eq 6 in the form of Eq 25. Every tick: 1/be shows in
+ * what is fast, which a window would level. */
 OWN_FRAME static void hydraulics_balance(struct estimator *e, const struct estimator_parameters *parameters,
                                          const struct estimator_constants *constants, enum joint i,
                                          const struct estimator_sample *now)
 {
     struct hydraulics *const h = &e->hydraulics[i];
     const scalar half = SCALAR(0.5);
-    const scalar lamA_R = mul(now->cylinder[i].lamA, now->cylinder[i].R);
-    const scalar lamB = now->cylinder[i].lamB;
-    const scalar lamC = now->cylinder[i].lamC;
-    const scalar flow_now = e->window.flow[i][e->turn];
-    if (e->samples > ROW_TURNS && h->gate > SCALAR(0)) {
-        /* trapezoids: of the window's ends the halves */
-        const scalar flow = sum_of_window(e->window.flow[i]) + mul(half, h->flow - flow_now);
+    const scalar filter = constants->tick_filter;
+    const struct cylinder_state *const cylinder = &now->cylinder[i];
+    const scalar lamA_R = mul(cylinder->lamA, cylinder->R);
+    if (e->samples > 1u && h->gate > SCALAR(0)) {
         const scalar noise = parameters->flow_noise[i];
-        const scalar g = mul(h->gate, quot(noise, noise + mul(parameters->flow_error, absolute(flow))));
-        const scalar w = amp(constants->per_window, sum_of_window(e->window.dq[i]));
+        const scalar g = mul(h->gate, quot(noise, noise + mul(parameters->flow_error, absolute(h->flow))));
+        const scalar w = amp(constants->per_tick, now->dq[i]);
         const scalar displaced = mul(mul(half, h->lamA_R + lamA_R), w);
-        low_pass_rate(&h->column[0], constants, mul(g, now->force[i] - h->force), SCALAR(0));
-        low_pass(&h->column[1], constants->filter, -mul(g, mul(half, h->lamB + lamB)));
-        low_pass(&h->column[2], constants->filter, -mul(g, mul(half, h->lamC + lamC)));
-        low_pass(&h->column[3], constants->filter, mul(g, displaced - flow));
+        const scalar flow = mul(half, h->flow + now->flow[i]);
+        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, mul(g, now->force[i] - h->force),
+                      SCALAR(0));
+        low_pass(&h->column[1], filter, -mul(g, mul(half, h->lamB + cylinder->lamB)));
+        low_pass(&h->column[2], filter, -mul(g, mul(half, h->lamC + cylinder->lamC)));
+        low_pass(&h->column[3], filter, mul(g, displaced - flow));
     } else {
-        low_pass_rate(&h->column[0], constants, SCALAR(0), SCALAR(0));
+        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, SCALAR(0), SCALAR(0));
         for (uint8_t k = 1; k <= HYDRAULIC_COLUMNS; k++) {
-            low_pass(&h->column[k], constants->filter, SCALAR(0));
+            low_pass(&h->column[k], filter, SCALAR(0));
         }
     }
     h->lamA_R = lamA_R;
-    h->lamB = lamB;
-    h->lamC = lamC;
+    h->lamB = cylinder->lamB;
+    h->lamC = cylinder->lamC;
     h->force = now->force[i];
-    h->flow = flow_now;
+    h->flow = now->flow[i];
     h->gate = gate(e, parameters, constants, now->reference_w[i]);
 }
 
@@ -386,9 +386,10 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
     take_sample(e, sample);
     if (!mechanics) { /* the ticks without the mechanics' update, which takes longer than all other parts of a row */
         mechanics_balance(e, parameters, constants, arm, i, sample);
-        hydraulics_balance(e, parameters, constants, i, sample);
     }
-    e->ramp = smaller(e->ramp + constants->ramp_step, SCALAR(1));
+    hydraulics_balance(e, parameters, constants, SWING, sample);
+    hydraulics_balance(e, parameters, constants, WRIST, sample);
+    e->ramp = smaller(e->ramp + constants->tick_filter, SCALAR(1));
     e->turn = (uint8_t)((e->turn + 1u) % ROW_TURNS);
 
     e->since_update = e->since_update < ROW_TURNS ? (uint8_t)(e->since_update + 1u) : ROW_TURNS;

@@ -1,8 +1,9 @@
 /* The indirect half of DIARC: least squares on filtered regressions, Eq 25 and 26.
  *
  * Rows in turn. There are four, mechanics and hydraulics of each joint; each tick one of them is taken into the estimate.
- * A joint's rows are balanced over the last ROW_TURNS ticks, the window, and filtered once in that time, when it is the
- * turn of its hydraulics: what is known changes little within a few ms, and no tick is much longer than the others.
+ * The mechanics of a joint are balanced over the last ROW_TURNS ticks, the window, and filtered once in that time, when it
+ * is the turn of its hydraulics: they change little within a few ms, and no tick is much longer than the others. The
+ * hydraulics are balanced and filtered every tick.
  *
  * Mechanics. Acceleration is never formed. The momentum m = row of H(q) q' is balanced between the middles of two
  * windows of length T,
@@ -15,8 +16,8 @@
  * Gate. At low speed friction is not what the model says, and at rest it looks like load: the gate opens with
  * the reference's speed, and the estimate rests while it is shut.
  *
- * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over the window against the flow's mean,
- *     1/be (F_k - F_(k-1)) / T = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
+ * Hydraulics. theta_h = [1/be, flow offsets]: F's increment over a tick against the flow's mean,
+ *     1/be (F_k - F_(k-1)) / dt = mean( -lamA R q' + QL - leakage + lamB Om2 + lamC Om3 )
  * with QL from the measured spool; no pressure is differentiated but inside the filter. Compressibility is
  * about a hundredth of the flow, as much as a valve gain may be wrong by: so a row weighs less the more flows.
  *
@@ -63,7 +64,8 @@ struct estimator_parameters {
 struct estimator_constants {
     scalar filter;            /* pole step, window / (filter_time + window) */
     gain filter_rate;         /* pole step / window, 1/s */
-    scalar ramp_step;         /* dt / (filter_time + dt) */
+    scalar tick_filter;       /* the pole step of what is filtered every tick, dt / (filter_time + dt) */
+    gain tick_filter_rate;    /* that over dt, 1/s */
     gain per_tick;            /* 1 / dt */
     gain per_window;          /* 1 / window */
     gain per_gate_rate;       /* 1 / gate_rate, s/rad */
@@ -121,7 +123,7 @@ struct mechanics {
 /* A row of the hydraulics. */
 struct hydraulics {
     struct two_poles column[HYDRAULIC_COLUMNS + 1];
-    scalar lamA_R, lamB, lamC, force, flow, gate; /* at the end of the window before */
+    scalar lamA_R, lamB, lamC, force, flow, gate; /* of the tick before */
     uint8_t
         strikes; /* innovations in a row that were too large: sensors contradict one another; stops at 255 */
 };
