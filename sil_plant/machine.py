@@ -300,7 +300,7 @@ def parameter_image(machine: Machine, changes: dict[str, Any] | None = None) -> 
 
 def key_ranges() -> dict[str, tuple[float, float]]:
     """Every key that a machine file can have, and its range."""
-    return machine_ranges(load_parameter_table())
+    return machine_ranges()
 
 
 def check_relations(machine: Machine) -> None:

@@ -200,7 +200,7 @@ static void happen(struct input *input, unsigned *ticks_left)
         break;
     case PROTECTED_FRAME:
         frame = frame_of(input);
-        e2e_protect((uint16_t)frame.id, (frame.data[1] & 0x0Fu) % E2E_COUNTER_STATES, frame.data);
+        e2e_protect((uint16_t)frame.id, (uint8_t)((frame.data[1] & 0x0Fu) % E2E_COUNTER_STATES), frame.data);
         bench_queue(&bench, frame);
         break;
     case TIME_JUMP:

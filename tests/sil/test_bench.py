@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import ROOT_PATH
+
+ROOT_PATH = Path(__file__).resolve().parents[2]
 
 FACTORS = ("sil", "mujoco", "mujoco_rk4", "scipy_rk45", "scipy_lsoda", "numpy")
 
