@@ -94,6 +94,8 @@ def test_no_source_is_left_out(target: Target, configure: Configure) -> None:
     """GIVEN the folders of the firmware WHEN configured THEN each file is compiled, for each number type."""
     files = set(sources(*(FOR_A_BOARD if target.preset else FOR_A_PC), GENERATED))
     units = units_for(target, configure)
+    if target.preset:
+        files.discard("firmware/ecu/store.c")  # an image without a memory for it: DIARC_IMAGE_STORE
     assert {unit.source for unit in units} == files
     if not target.preset:
         pairs = {(unit.source, unit.scalar) for unit in units}
