@@ -111,7 +111,9 @@ class Inputs(NamedTuple):
 def inputs_of(session: Session) -> Inputs:
     """What the plant of a run was given, in two pieces for each tick."""
     record, timing, errors = session.record, session.timing, session.errors
-    faults = injection.make_injection((), 0, timing.period_s, 0, np.zeros((3, 16), dtype=np.uint8))
+    faults = injection.make_injection(
+        (), 0, timing.period_s, 0, np.zeros((injection.RECOVERY_ROWS, 16), dtype=np.uint8)
+    )
     faults = session.injection._replace(number=faults.number, count=faults.count)
     first = max(session.timeline.parked - 1, 0)
     follow = np.clip(np.zeros(2), *(record.valves[first, :2] + 0.5 * errors.hysteresis * s for s in (-1.0, 1.0)))
