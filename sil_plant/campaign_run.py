@@ -22,7 +22,7 @@ from sil_plant.inproc import LIBRARIES
 from sil_plant.io_node import node_errors
 from sil_plant.machine import JOINT_NAMES, with_changes
 from sil_plant.results import emergencies
-from sil_plant.session import FAULTED
+from sil_plant.session import FAULTED, MODE_COMMISSION
 
 # How an arm can end, in order of how far it came.
 CANNOT_START = "cannot start"  # a cylinder cannot hold the load at the start
@@ -100,7 +100,7 @@ def run_arm(base: Base, arm: Arm) -> ArmRun:
             done = simulate(identification)
         except ValueError as error:
             return ArmRun(CANNOT_START, f"commissioning: {error}")
-        problem = problem_of(done.session)
+        problem = problem_of(done.session, MODE_COMMISSION)
         if problem:
             return ArmRun(COMMISSIONING_FAULTED, problem)
         try:

@@ -70,6 +70,8 @@ OPEN_LIMITS = {
     "supervision.saturation_s": 30.0,
     "supervision.bound_s": 30.0,
     "supervision.mismatch_updates": 30.0,
+    "supervision.contradiction_rad_s": 30.0,
+    "supervision.spool_error": 2.0,
 }
 REQUESTS = {
     code: str(name)
