@@ -321,6 +321,8 @@ class Proposer:
         add("supervision.stuck_rad", 0.003, "many steps of an encoder")
         add("supervision.stuck_s", 0.1, "many samples of pressure noise")
         add("supervision.mismatch_updates", 25, "the same for every machine so far")
+        add("supervision.contradiction_rad_s", 0.1, "the same for every machine so far")
+        add("supervision.spool_error", 0.3, "the same for every machine so far")
         spare = min(c.margin / float(c.lever(np.array([c.q_min, c.q_max])).max()) for c in cylinders)
         why = f"a third of the spare stroke ({spare:.2g} rad), 0.02 at most"
         add("supervision.angle_margin_rad", two_digits(min(spare / 3.0, 0.02)), why)
