@@ -169,8 +169,8 @@ def save_in_ecu(ecu: EcuParameters, machine: Machine, found: list[Finding]) -> N
     for name, value in ours.items():
         if name not in found_keys and theirs[name] != value:
             raise RefusedError(
-                f"the ECU is set up for another machine than {machine.path} ({name} is {theirs[name]:.9g}, there "
-                f"{value:.9g}), so nothing was saved in it; give it this one (params.py load FILE) and commission again"
+                f"the ECU is set up for another machine than {machine.path} ({name} is {theirs[name]:.7g}, there "
+                f"{value:.7g}), so nothing was saved in it; give it this one (params.py load FILE) and commission again"
             )
     ecu.change({f"estimator.prior.{f.prior}.value": f.value for f in found})
     ecu.save()

@@ -115,6 +115,7 @@ def over_bus(
     image: bytes,
     progress: Callable[[int], None],
     quiet: bool,
+    *,
     plant: ExternalPlant | None = None,
     afterwards: Callable[[str], None] | None = None,
     commands: bus_run.Commands | None = None,

@@ -458,10 +458,14 @@ def limits(case: Case) -> Iterator[Finding]:
     for joint in range(2):
         c = cylinder_of(m, joint)
         smallest = c.dead_volume + c.area2 * c.margin
-        worst = max(worst, c.kv * math.sqrt(supply) / smallest / m["estimator.prior.beta_inverse_1_Pa.value"] * 1e-3)
+        flow = max(float(demand.opening[:, joint].max()) for demand in case.demands) * c.kv * math.sqrt(supply)
+        worst = max(worst, flow / smallest / m["estimator.prior.beta_inverse_1_Pa.value"] * 1e-3)
     step = m["supervision.pressure_step_Pa"]
     if step < 0.3 * worst:
-        what = f"{step / BAR:.0f} bar in a tick; the full valve makes up to {worst / BAR:.0f} bar at a piston's end"
+        what = (
+            f"{step / BAR:.0f} bar in a tick; the valve as open as in these moves makes up to {worst / BAR:.0f} bar "
+            "at a piston's end"
+        )
         yield Finding(
             WARNING, "supervision.pressure_step_Pa", what, f"{1.2 * worst:.2g}, or SENSOR_RATE stops a healthy arm"
         )

@@ -255,7 +255,7 @@ def carry_out(arguments: argparse.Namespace, cleanup: ExitStack) -> int:
                     image,
                     progress,
                     arguments.quiet,
-                    inputs.plant,
+                    plant=inputs.plant,
                     commands=control,
                     endless=arguments.endless,
                 )

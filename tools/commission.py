@@ -95,7 +95,7 @@ def move(
         finish(run, None)
     else:
         pace = arguments.pace if arguments.ecu == "spawn" else None
-        execution.over_bus(run, address, pace, image, lambda _: None, False, lambda bus: finish(run, bus))
+        execution.over_bus(run, address, pace, image, lambda _: None, False, afterwards=lambda bus: finish(run, bus))
 
 
 def found_in(run: session.Session, machine: Machine) -> list[commissioning.Finding]:

@@ -151,7 +151,7 @@ def test_jump_through_a_register_that_the_compiler_does_not_tell_of_is_refused()
 
 def test_calls_through_the_port_are_those_of_the_image() -> None:
     """GIVEN a call of the port's send WHEN calls are resolved THEN the path goes through the function that is in it."""
-    path = budget.ROOT / "firmware" / "ecu" / "ecu.c"
+    path = budget.ROOT / "firmware" / "ecu" / "transmit.c"
     lines = path.read_text(encoding="utf-8").splitlines()
     row = next(k for k, line in enumerate(lines) if "port->send(" in line)
     graph = budget.CallGraph()

@@ -80,6 +80,12 @@ REQUESTS = {
 
 
 @pytest.fixture(scope="session")
+def open_limits() -> dict[str, float]:
+    """The limits wide open, by their keys in a machine file."""
+    return dict(OPEN_LIMITS)
+
+
+@pytest.fixture(scope="session")
 def open_image(machine: Machine) -> Callable[..., bytes]:
     """Parameter images with the limits wide open: ``open_image(changes)``."""
 

@@ -407,13 +407,17 @@ def test_load_that_the_map_states_is_not_the_scenarios(
 def test_fixed_step_of_an_fmu_is_not_ignored(
     plants: dict[str, Path], rewritten, machine: Machine, paper: Scenario, native
 ) -> None:
-    """GIVEN FMUs with one step each WHEN it divides the tick's parts THEN the same trace, else a message."""
+    """GIVEN FMUs with one step each WHEN it divides the tick's parts THEN the same trace to its accuracy, else a message."""
     fixed = ('canHandleVariableCommunicationStepSize="true"', 'canHandleVariableCommunicationStepSize="false"')
-    good = rewritten(plants["2.0"], "quarter.fmu", fixed, ('stepSize="0.0005"', 'stepSize="0.00025"'))
-    run, _ = run_external(machine, paper, good, MAP, 0.5)
     expected = native(0.5).record
+    good = rewritten(plants["2.0"], "half.fmu", fixed, ('stepSize="0.001"', 'stepSize="0.0005"'))
+    run, _ = run_external(machine, paper, good, MAP, 0.5)
     assert np.array_equal(run.record.state, expected.state)
-    bad = rewritten(plants["2.0"], "third.fmu", fixed, ('stepSize="0.0005"', 'stepSize="0.0003"'))
+    finer = rewritten(plants["2.0"], "quarter.fmu", fixed, ('stepSize="0.001"', 'stepSize="0.00025"'))
+    run, _ = run_external(machine, paper, finer, MAP, 0.5)
+    apart = np.abs(run.record.state - expected.state)[:, plant.Q : plant.W].max()
+    assert 0.0 < apart < 2e-6  # the plant's own steps end where the FMU's do
+    bad = rewritten(plants["2.0"], "third.fmu", fixed, ('stepSize="0.001"', 'stepSize="0.0003"'))
     with pytest.raises(ConfigError, match=r"third\.fmu: takes steps of 0\.0003 s only.*io\.command_delay_s"):
         run_external(machine, paper, bad, MAP)
 

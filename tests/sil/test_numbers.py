@@ -16,7 +16,8 @@ def test_number_type_does_not_cost_accuracy() -> None:
     command = [sys.executable, str(ROOT / "tools" / "agreement.py"), "--check"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
-    rows = [line for line in result.stdout.splitlines() if line.startswith("| joint angle")]
-    assert len(rows) == 1
-    apart = [float(cell) for cell in rows[0].split("|")[2:4]]
-    assert 0.0 < apart[0] < apart[1] < 1e-3
+    rows = [line for line in result.stdout.splitlines() if line.startswith(("| joint angle", "| spool set-point"))]
+    assert len(rows) == 2
+    angle, spool = ([float(cell) for cell in row.split("|")[2:4]] for row in rows)
+    assert 0.0 < min(angle) and max(angle) < 1e-3
+    assert 0.0 < spool[0] < spool[1] < 1e-2
