@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -54,13 +55,11 @@ def build() -> Path:
     return BUILD / "tests"
 
 
-@pytest.mark.timeout(BUILD_LIMIT_S * 2 + SECONDS + 120)
-@pytest.mark.parametrize("name", HARNESSES)
-def test_something_on_the_bus_breaks_the_ecu(build: Path, name: str) -> None:
-    """GIVEN the inputs that are kept WHEN libFuzzer goes on from them THEN nothing that must hold is broken."""
+def fuzz(build: Path, name: str) -> list[str]:
+    """The command that fuzzes with a harness."""
     found = BUILD / f"found-{name}"
     found.mkdir(exist_ok=True)
-    command = [
+    return [
         str(build / f"fuzz_{name}_double"),
         f"-max_total_time={SECONDS}",
         "-max_len=512",
@@ -71,11 +70,26 @@ def test_something_on_the_bus_breaks_the_ecu(build: Path, name: str) -> None:
         str(found),
         str(HERE / "corpus" / name),
     ]
-    result = run(command, SECONDS + 100)
+
+
+@pytest.fixture(scope="module")
+def ended(build: Path) -> dict[str, subprocess.CompletedProcess[str]]:
+    """How all harnesses ended, which ran side by side."""
+    with ThreadPoolExecutor(len(HARNESSES)) as pool:
+        return dict(
+            zip(HARNESSES, pool.map(lambda name: run(fuzz(build, name), SECONDS + 100), HARNESSES), strict=True)
+        )
+
+
+@pytest.mark.timeout(BUILD_LIMIT_S * 2 + SECONDS + 120)
+@pytest.mark.parametrize("name", HARNESSES)
+def test_something_on_the_bus_breaks_the_ecu(ended: dict[str, subprocess.CompletedProcess[str]], name: str) -> None:
+    """GIVEN the inputs that are kept WHEN libFuzzer goes on from them THEN nothing that must hold is broken."""
+    result = ended[name]
     if result.returncode != 0:
         pytest.fail(
             f"{result.stdout[-6000:]}\nKeep the input as a test: mv {BUILD.relative_to(ROOT)}/crash-.. "
-            f"tests/fuzz/crashes/{name}/NAME; to look into it: FUZZ_TRACE=1 {command[0]} FILE",
+            f"tests/fuzz/crashes/{name}/NAME; to look into it: FUZZ_TRACE=1 {result.args[0]} FILE",
             pytrace=False,
         )
     assert "stat::number_of_executed_units:" in result.stdout
