@@ -90,6 +90,7 @@ class Bench:
         self.bus, self.io, self.network, self.folder = bus, io, network, folder
         self.node = network.add_node(canopen.RemoteNode(1, str(EDS_PATH)))
         self.node.sdo.RESPONSE_TIMEOUT = 5.0
+        self.node.sdo.MAX_RETRIES = 2
 
     def power_on(self) -> subprocess.Popen:
         """Start the ECU; returns when it has booted up."""
@@ -171,6 +172,7 @@ def bench(shared: Bench) -> Iterator[Bench]:
         shared.node.nmt.state = "OPERATIONAL"
         shared.until_mode(STANDBY)
         yield shared
+        assert process.poll() is None, (shared.folder / "ecu.err").read_text()
     finally:
         process.terminate()
         try:
