@@ -73,14 +73,14 @@ def main(argv: list[str]) -> int:
         return EXIT_WRONG_USE
     signal.signal(signal.SIGTERM, _interrupt)
     # imported here, for the workers that are spawned read this file, too
-    from sil_plant.campaign_pool import ClusterLostError
+    from sil_plant.campaign_pool import WorkersLostError
 
     try:
         return _main(arguments)
     except ConfigError as error:
         say(f"campaign.py: {error}")
         return EXIT_WRONG_USE
-    except ClusterLostError as error:
+    except WorkersLostError as error:
         say(f"campaign.py: {error}; finished batches are kept, continue with --resume")
         return EXIT_FAILED
     except KeyboardInterrupt:
