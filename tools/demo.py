@@ -38,6 +38,7 @@ enter(__file__)
 from sil_plant import figures, protocol  # noqa: E402
 from sil_plant.buses import BusAddress, BusError, open_frame_port, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
+from sil_plant.host import kernel_has_can  # noqa: E402
 from sil_plant.hub import DEFAULT_PORT  # noqa: E402
 
 OUT = ROOT / "out"
@@ -163,15 +164,6 @@ def check_bus(address: BusAddress) -> None:
             )
     if led_by_another:
         raise BusError(f"another ECU is on {address}; stop it, or use another bus: --bus vcan1")
-
-
-def kernel_has_can() -> bool:
-    """Whether this kernel knows CAN sockets."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (OSError, AttributeError):
-        return False
-    return True
 
 
 def raise_interface(name: str) -> None:

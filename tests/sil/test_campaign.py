@@ -27,6 +27,7 @@ from sil_plant.campaign_run import code_hash, run_batch, warm_up
 from sil_plant.campaign_sampling import arms
 from sil_plant.campaign_spec import CAMPAIGNS, Campaign, load_campaign
 from sil_plant.config import ROOT, ConfigError
+from tests.sil.campaign_specs import VARY_LOAD_AND_BORE
 
 CAMPAIGN_PY = ROOT / "tools" / "campaign.py"
 LIMIT_S = 110.0
@@ -56,17 +57,7 @@ commission = false
 scenario = "scenario.toml"
 [limits]
 load_err_kg = 0.05
-[[vary]]
-key = "load_kg"
-distribution = "uniform"
-low = 0
-high = 10
-[[vary]]
-key = "wrist.bore_m"
-distribution = "normal"
-relative = true
-sd = 0.001
-[[vary]]
+{VARY_LOAD_AND_BORE}[[vary]]
 key = "effects.pressure_gain_error"
 distribution = "uniform"
 low = 0

@@ -85,37 +85,23 @@ static void queue(struct can_frame_11bit frame)
 
 static void queue_nmt(uint8_t command)
 {
-    queue((struct can_frame_11bit){.id = 0, .length = 2, .data = {command, 0}});
+    queue(nmt_frame(command, 0));
 }
 
 static void queue_request(uint8_t request)
 {
     static uint8_t counter;
-    struct can_frame_11bit frame = {.id = 0x201, .length = 8};
-    put_bits(frame.data, 16, 4, request);
-    put_bits(frame.data, 48, 16, 1);
     counter = (uint8_t)((counter + 1u) % E2E_COUNTER_STATES);
-    e2e_protect(0x201, counter, frame.data);
-    queue(frame);
+    queue(motion_frame(request, 0, 0, 0, 1, counter));
 }
 
 /* An arm that rests at 0.1 rad with 3 kg. */
 static void queue_sensors(void)
 {
     const uint8_t counter = (uint8_t)((ecu.sync_counter - 1u) % E2E_COUNTER_STATES);
-    struct can_frame_11bit encoders = {.id = 0x182, .length = 8};
-    put_bits(encoders.data, 16, 24, 267013);
-    put_bits(encoders.data, 40, 24, 267013);
-    e2e_protect(0x182, counter, encoders.data);
-    queue(encoders);
-    static const double rest_bar[JOINTS][CHAMBERS] = {{50, 73.14}, {42.06, 50}};
+    queue(encoders_frame(267013, 267013, 0, counter));
     for (uint8_t i = 0; i < JOINTS; i++) {
-        const uint16_t id = i == SWING ? 0x282 : 0x382;
-        struct can_frame_11bit pressures = {.id = id, .length = 8};
-        put_bits(pressures.data, 16, 16, (int64_t)(rest_bar[i][BORE] * 200));
-        put_bits(pressures.data, 32, 16, (int64_t)(rest_bar[i][ANNULUS] * 200));
-        e2e_protect(id, counter, pressures.data);
-        queue(pressures);
+        queue(pressures_frame(i, REST_PRESSURE[i], 0, 0, counter));
     }
 }
 
