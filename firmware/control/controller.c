@@ -1,14 +1,14 @@
 #include "control/controller.h"
 
-SELDOM struct controller_constants controller_constants(const struct machine *machine, scalar dt_s)
+SELDOM void controller_constants(struct controller_constants *constants, const struct machine *machine,
+                                 scalar dt_s)
 {
-    struct controller_constants constants = {.dt_s = dt_s};
+    constants->dt_s = dt_s;
     for (uint8_t i = 0; i < JOINTS; i++) {
-        constants.cylinder[i] = cylinder_constants(&machine->cylinder[i]);
+        constants->cylinder[i] = cylinder_constants(&machine->cylinder[i]);
     }
-    constants.observer = observer_constants(machine->observer_bandwidth, dt_s);
-    constants.estimator = estimator_constants(&machine->estimator, dt_s);
-    return constants;
+    constants->observer = observer_constants(machine->observer_bandwidth, dt_s);
+    estimator_constants(&constants->estimator, &machine->estimator, dt_s);
 }
 
 SELDOM void controller_start(struct controller *controller, const struct machine *machine,
@@ -214,8 +214,9 @@ OWN_FRAME static void diarc_law(struct controller *controller, const struct mach
     }
 }
 
-void controller_step(struct controller *controller, const struct machine *machine,
-                     const struct controller_constants *constants, const struct measurement *measured)
+OWN_FRAME void controller_step(struct controller *controller, const struct machine *machine,
+                               const struct controller_constants *constants,
+                               const struct measurement *measured)
 {
     struct estimator_sample sample;
     struct joint_flow flow[JOINTS];

@@ -65,7 +65,8 @@ struct controller {
     struct joint_output output[JOINTS];
 };
 
-struct controller_constants controller_constants(const struct machine *machine, scalar dt_s);
+/* Where they are kept: too many to pass them as a value. */
+void controller_constants(struct controller_constants *constants, const struct machine *machine, scalar dt_s);
 
 /* Disarmed, estimate at the priors. */
 void controller_start(struct controller *controller, const struct machine *machine,

@@ -14,35 +14,34 @@ static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
     [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
 };
 
-SELDOM struct estimator_constants estimator_constants(const struct estimator_parameters *parameters,
-                                                      scalar dt_s)
+SELDOM void estimator_constants(struct estimator_constants *constants,
+                                const struct estimator_parameters *parameters, scalar dt_s)
 {
-    struct estimator_constants constants = {0};
     const scalar window_s = mul(dt_s, SCALAR(ROW_TURNS));
-    constants.filter = quot(window_s, parameters->filter_time + window_s);
-    constants.filter_rate = gain_quot(constants.filter, window_s);
-    constants.tick_filter = quot(dt_s, parameters->filter_time + dt_s);
-    constants.tick_filter_rate = gain_quot(constants.tick_filter, dt_s);
-    constants.per_tick = gain_quot(SCALAR(1), dt_s);
-    constants.per_window = gain_quot(SCALAR(1), window_s);
-    constants.per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
+    constants->filter = quot(window_s, parameters->filter_time + window_s);
+    constants->filter_rate = gain_quot(constants->filter, window_s);
+    constants->tick_filter = quot(dt_s, parameters->filter_time + dt_s);
+    constants->tick_filter_rate = gain_quot(constants->tick_filter, dt_s);
+    constants->per_tick = gain_quot(SCALAR(1), dt_s);
+    constants->per_window = gain_quot(SCALAR(1), window_s);
+    constants->per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
     for (uint8_t i = 0; i < JOINTS; i++) {
-        constants.noise_m[i] = variance_of(parameters->torque_noise[i]);
-        constants.noise_h[i] = variance_of(parameters->flow_noise[i]);
+        constants->noise_m[i] = variance_of(parameters->torque_noise[i]);
+        constants->noise_h[i] = variance_of(parameters->flow_noise[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
-        constants.scale_m[k] = parameters->m[k].high - parameters->m[k].low;
-        constants.step_m[k] = mul(constants.scale_m[k], amp(parameters->rate_limit, dt_s));
+        constants->scale_m[k] = parameters->m[k].high - parameters->m[k].low;
+        constants->step_m[k] = mul(constants->scale_m[k], amp(parameters->rate_limit, dt_s));
     }
     for (uint8_t k = 0; k < THETA_H; k++) {
-        constants.scale_h[k] = parameters->h[k].high - parameters->h[k].low;
-        constants.step_h[k] = mul(constants.scale_h[k], amp(parameters->rate_limit, dt_s));
+        constants->scale_h[k] = parameters->h[k].high - parameters->h[k].low;
+        constants->step_h[k] = mul(constants->scale_h[k], amp(parameters->rate_limit, dt_s));
     }
     /* two updates, one per row of the mechanics, every ROW_TURNS ticks */
     const scalar walk_s = mul(dt_s, SCALAR(WALK_UPDATES * ROW_TURNS / 2));
-    constants.walk = scale_variance(variance_of(quot(parameters->load_walk, constants.scale_m[M_T])), walk_s);
-    constants.load_variance = variance_of(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
-    return constants;
+    constants->walk =
+        scale_variance(variance_of(quot(parameters->load_walk, constants->scale_m[M_T])), walk_s);
+    constants->load_variance = variance_of(quot(parameters->m[M_T].sd, constants->scale_m[M_T]));
 }
 
 /* Commissioning knows a parameter to a quarter of its range. */
@@ -374,9 +373,9 @@ static bool rate_limit(scalar law[], const scalar theta[], const scalar step[], 
     return there;
 }
 
-void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
-                    const struct estimator_constants *constants, const struct arm *arm,
-                    const struct estimator_sample *sample)
+OWN_FRAME void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
+                              const struct estimator_constants *constants, const struct arm *arm,
+                              const struct estimator_sample *sample)
 {
     if (e->samples <= 2u * ROW_TURNS) {
         e->samples++;

@@ -151,7 +151,8 @@ struct estimator {
     uint8_t since_update;
 };
 
-struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s);
+void estimator_constants(struct estimator_constants *constants, const struct estimator_parameters *parameters,
+                         scalar dt_s);
 
 /* Everything back to the priors. */
 void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,

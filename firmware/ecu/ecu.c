@@ -85,7 +85,7 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
         return ECU_PERIOD_RANGE;
     }
     ecu->period_us = period_us;
-    ecu->constants = controller_constants(&ecu->machine, dt_s);
+    controller_constants(&ecu->constants, &ecu->machine, dt_s);
     restart(ecu);
     return ECU_OK;
 }
@@ -129,7 +129,7 @@ static void shut_valves(struct ecu *ecu, const struct ecu_port *port)
     }
 }
 
-void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
 {
     if (ecu->restart_requested) {
         shut_valves(ecu, port);
@@ -191,7 +191,7 @@ static void receive_frame(struct ecu *ecu, const struct ecu_port *port, const st
     }
 }
 
-bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
 {
     struct can_frame_11bit frame;
     const bool was_complete = receive_complete(&ecu->receive);
@@ -288,7 +288,7 @@ static void work(struct ecu *ecu, const struct ecu_port *port)
     operation_step(ecu);
 }
 
-void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
 {
     if (!receive_complete(&ecu->receive)) {
         count_u16(&ecu->counters.late_ticks);

@@ -531,7 +531,8 @@ static void test_covariance_of_a_moving_arm_lost(void)
     struct machine machine;
     struct bases bases;
     load_reference_arm(&machine, &bases);
-    const struct estimator_constants constants = estimator_constants(&machine.estimator, SCALAR(1e-3));
+    struct estimator_constants constants;
+    estimator_constants(&constants, &machine.estimator, SCALAR(1e-3));
     static struct estimator estimator;
     estimator_start(&estimator, &machine.estimator, &constants);
     struct ud_factors *const ud = &estimator.covariance_m;
