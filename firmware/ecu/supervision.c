@@ -56,6 +56,7 @@ static uint8_t count_of(scalar number)
 
 void supervision_start(struct ecu *ecu)
 {
+    samples_start(ecu);
     const struct limits *const limits = &ecu->machine.limits;
     const uint32_t period_us = ecu->period_us;
     ecu->supervision = (struct supervision){
