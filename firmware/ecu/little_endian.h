@@ -11,9 +11,19 @@ static inline uint32_t get_u32(const uint8_t *bytes)
 
 static inline void put_u32(uint8_t *bytes, uint32_t value)
 {
-    for (uint8_t k = 0; k < 4u; k++) {
-        bytes[k] = (uint8_t)(value >> (8u * k));
-    }
+    bytes[0] = (uint8_t)value; /* no loop: compilers make one store of it */
+    bytes[1] = (uint8_t)(value >> 8);
+    bytes[2] = (uint8_t)(value >> 16);
+    bytes[3] = (uint8_t)(value >> 24);
+}
+
+/* The data of a frame, by words. */
+static inline void copy_data(uint8_t to[8], const uint8_t from[8])
+{
+    const uint32_t first = get_u32(from);
+    const uint32_t last = get_u32(&from[4]);
+    put_u32(to, first);
+    put_u32(&to[4], last);
 }
 
 #endif

@@ -4,6 +4,9 @@
 #include <stdint.h>
 #include <string.h>
 
+#undef memcpy
+#undef memset
+
 /* Words that may alias any object. */
 typedef uint32_t __attribute__((may_alias)) word;
 
