@@ -15,7 +15,6 @@
 #include <stdint.h>
 
 /* Before loops of a few passes: there are no registers for a row of numbers, and code takes flash. */
-#define UNROLLS_SHORT_LOOPS false
 #define UNROLL_SHORT_LOOP
 
 typedef int32_t scalar;   /* Q7.24 */
@@ -183,6 +182,12 @@ static inline scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
     return __builtin_constant_p(fraction_bits) && fraction_bits <= SCALAR_FRACTION
                ? fixed_saturate((int64_t)raw * ((int64_t)1 << (SCALAR_FRACTION - fraction_bits)))
                : fixed_from_raw(raw, fraction_bits);
+}
+
+/* The same where |raw| 2^-fraction_bits < 16 is known, and fraction_bits at most SCALAR_FRACTION. */
+static inline scalar scalar_from_small(int32_t raw, uint8_t fraction_bits)
+{
+    return raw * ((int32_t)1 << (SCALAR_FRACTION - fraction_bits));
 }
 
 /* part / whole of two counts, part <= whole < 2^31. */

@@ -10,7 +10,7 @@
 
 static scalar angle_of(int32_t raw)
 {
-    return WIRE_DECODE(raw, DIARC_ENCODERS_SWING_ANGLE, 0);
+    return WIRE_DECODE_SMALL(raw, DIARC_ENCODERS_SWING_ANGLE);
 }
 
 /* A raw pressure has 16 bits: it is a share of what 2^16 steps are. */
@@ -18,7 +18,7 @@ static scalar angle_of(int32_t raw)
 
 static scalar pressure_of(const struct ecu *ecu, uint16_t raw)
 {
-    return mul(scalar_from_raw(raw, PRESSURE_BITS), ecu->full_pressure);
+    return mul(scalar_from_small(raw, PRESSURE_BITS), ecu->full_pressure);
 }
 
 static int32_t raw_angle(scalar q)
@@ -190,7 +190,7 @@ struct measurement samples_measured(const struct ecu *ecu, const struct sensor_s
         m.dq[i] = angle_of(now->angle[i] - before->angle[i]);
         m.p[i][BORE] = pressure_of(ecu, now->pressure[i][BORE]) - ecu->tare.offset[i][BORE];
         m.p[i][ANNULUS] = pressure_of(ecu, now->pressure[i][ANNULUS]) - ecu->tare.offset[i][ANNULUS];
-        m.spool[i] = WIRE_DECODE(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
+        m.spool[i] = WIRE_DECODE_SMALL(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION);
     }
     return m;
 }
