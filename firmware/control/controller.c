@@ -89,24 +89,38 @@ OWN_FRAME static void take_sample(const struct controller *controller, const str
 struct row_torques {
     scalar torque;      /* phi' theta + known */
     scalar uncertainty; /* |theta_max - theta_min| |phi| */
-    scalar step;        /* phi' (theta - before) */
 };
 
 static struct row_torques row_torques(const struct arm_row *row, enum joint i, const scalar theta[THETA_M],
-                                      const scalar before[THETA_M], const scalar range[THETA_M])
+                                      const scalar range[THETA_M])
 {
     wide torque = wide_of(row->known);
     wide uncertainty = wide_of(SCALAR(0));
-    wide step = wide_of(SCALAR(0));
     UNROLL_SHORT_LOOP
     for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
         const uint8_t parameter = row_parameter(i, k);
         const scalar phi = row->phi[k];
         torque = add_product(torque, phi, theta[parameter]);
         uncertainty = add_product(uncertainty, absolute(phi), range[parameter]);
-        step = add_product(step, phi, theta[parameter] - before[parameter]);
     }
-    return (struct row_torques){narrow(torque), narrow(uncertainty), narrow(step)};
+    return (struct row_torques){narrow(torque), narrow(uncertainty)};
+}
+
+/* phi' (theta - before), by how much the estimate moved the torque. */
+static scalar torque_step(const struct controller *controller, const struct arm_row *row, enum joint i)
+{
+    const struct estimator *const e = &controller->estimator;
+    wide step = wide_of(SCALAR(0));
+    if (!e->law_m_moved || !controller->diarc[i].started) {
+        return SCALAR(0); /* before the first tick there is none */
+    }
+    UNROLL_SHORT_LOOP
+    for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
+        if (k > (uint8_t)COL_M_T || controller->kind == CONTROLLER_DIARC) {
+            step = add_product(step, row->phi[k], e->moved_m[row_parameter(i, k)]);
+        }
+    }
+    return narrow(step);
 }
 
 static scalar diarc_joint(struct controller *controller, const struct machine *machine,
@@ -124,15 +138,14 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
 
     struct arm_row phi2;
     arm_inverse_dynamics(&machine->arm, desired, i, w, a, sample->friction_sign[i], sample->lever[i], &phi2);
-    const struct row_torques torques =
-        row_torques(&phi2, i, theta, controller->law_m_before, ranges->scale_m);
+    const struct row_torques torques = row_torques(&phi2, i, theta, ranges->scale_m);
     const struct diarc_input in = {
         .e1 = out->e1,
         .e1_rate = out->e1_rate,
         .reference_w = w[i],
         .torque_ff = torques.torque,
         .torque_uncertainty = torques.uncertainty,
-        .torque_step = torques.step,
+        .torque_step = torque_step(controller, &phi2, i),
         .H = arm_inertia(&machine->arm, desired, i, theta),
         .beta_inverse = theta_h[BETA_INVERSE],
         .beta_share = beta_share,
@@ -186,16 +199,14 @@ OWN_FRAME static void diarc_law(struct controller *controller, const struct mach
                                 const struct measurement *measured, const struct estimator_sample *sample,
                                 const struct joint_flow flow[JOINTS])
 {
-    scalar theta[THETA_M]; /* the estimate, or the estimate without its load */
-    for (uint8_t k = 0; k < THETA_M; k++) {
-        theta[k] = controller->estimator.law_m[k];
-    }
+    const scalar *theta = controller->estimator.law_m;
+    scalar without_load[THETA_M];
     if (controller->kind != CONTROLLER_DIARC) {
-        theta[M_T] = SCALAR(0);
-    }
-    scalar *const before = controller->law_m_before;
-    for (uint8_t k = 0; k < THETA_M && !controller->diarc[SWING].started; k++) {
-        before[k] = theta[k]; /* no step of the estimate before the first tick */
+        for (uint8_t k = 0; k < THETA_M; k++) {
+            without_load[k] = theta[k];
+        }
+        without_load[M_T] = SCALAR(0);
+        theta = without_load;
     }
     const struct wrist_trig desired = wrist_trig(&machine->arm, controller->output[WRIST].reference.q);
     const scalar beta_share =
@@ -208,9 +219,6 @@ OWN_FRAME static void diarc_law(struct controller *controller, const struct mach
         const scalar spool = valve_spool(&machine->cylinder[i], u);
         const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);
         out->u = limit(spool + lead, SCALAR(-1), SCALAR(1));
-    }
-    for (uint8_t k = 0; k < THETA_M; k++) {
-        before[k] = theta[k];
     }
 }
 

@@ -61,7 +61,6 @@ struct controller {
     struct estimator estimator;
     struct diarc diarc[JOINTS];
     struct pid pid[JOINTS];
-    scalar law_m_before[THETA_M]; /* the law's estimate of the tick before */
     struct joint_output output[JOINTS];
 };
 

@@ -112,11 +112,13 @@ SELDOM static void start_filters(struct estimator *estimator)
         struct hydraulics *const h = &estimator->hydraulics[i];
         for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
             m->column[k] = (struct two_poles){0};
+            m->step[k] = SCALAR(0);
         }
         for (uint8_t k = 0; k <= HYDRAULIC_COLUMNS; k++) {
             h->column[k] = (struct two_poles){0};
         }
         m->open = (struct two_poles){0};
+        h->step = SCALAR(0);
         m->gate = SCALAR(0);
         h->gate = SCALAR(0);
         m->strikes = 0;
@@ -140,11 +142,12 @@ static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
 }
 
 /* The same of step / T + x, with pole_rate = pole_step / T. */
-static void low_pass_rate(struct two_poles *filter, scalar pole_step, gain pole_rate, scalar step, scalar x)
+static void low_pass_rate(struct two_poles *filter, scalar *sum, scalar pole_step, gain pole_rate, scalar step,
+                          scalar x)
 {
-    filter->step += step - mul(pole_step, filter->step);
+    *sum += step - mul(pole_step, *sum);
     filter->first += mul(pole_step, x - filter->first);
-    const scalar first = filter->first + amp(pole_rate, filter->step);
+    const scalar first = filter->first + amp(pole_rate, *sum);
     filter->second += mul(pole_step, first - filter->second);
 }
 
@@ -215,10 +218,10 @@ OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estima
         const scalar g = m->gate;
         low_pass(&m->open, constants->filter, g);
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-            low_pass_rate(&m->column[k], constants->filter, constants->filter_rate,
+            low_pass_rate(&m->column[k], &m->step[k], constants->filter, constants->filter_rate,
                           mul(g, momentum.phi[k] - before->phi[k]), mul(g, force.phi[k]));
         }
-        low_pass_rate(&m->column[ROW_COLUMNS], constants->filter, constants->filter_rate,
+        low_pass_rate(&m->column[ROW_COLUMNS], &m->step[ROW_COLUMNS], constants->filter, constants->filter_rate,
                       mul(g, momentum.known - before->known), mul(g, force.known - torque));
     }
     m->momentum = momentum;
@@ -248,13 +251,13 @@ OWN_FRAME static void hydraulics_balance(struct estimator *e, const struct estim
         const scalar w = amp(constants->per_tick, now->dq[i]);
         const scalar displaced = mul(mul(half, h->lamA_R + lamA_R), w);
         const scalar flow = mul(half, h->flow + now->flow[i]);
-        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, mul(g, now->force[i] - h->force),
+        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate, mul(g, now->force[i] - h->force),
                       SCALAR(0));
         low_pass(&h->column[1], filter, -mul(g, mul(half, h->lamB + cylinder->lamB)));
         low_pass(&h->column[2], filter, -mul(g, mul(half, h->lamC + cylinder->lamC)));
         low_pass(&h->column[3], filter, mul(g, displaced - flow));
     } else {
-        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, SCALAR(0), SCALAR(0));
+        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate, SCALAR(0), SCALAR(0));
         for (uint8_t k = 1; k <= HYDRAULIC_COLUMNS; k++) {
             low_pass(&h->column[k], filter, SCALAR(0));
         }
@@ -358,15 +361,17 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
 }
 
 /* sat_M: the law's estimate follows by at most `step` a tick. True when it is there. */
-static bool rate_limit(scalar law[], const scalar theta[], const scalar step[], uint8_t size)
+static bool rate_limit(scalar law[], scalar moved[], const scalar theta[], const scalar step[], uint8_t size)
 {
     bool there = true;
     for (uint8_t k = 0; k < size; k++) {
         const scalar change = theta[k] - law[k];
         if (absolute(change) <= step[k]) {
+            moved[k] = change;
             law[k] = theta[k];
         } else {
-            law[k] += change > SCALAR(0) ? step[k] : -step[k];
+            moved[k] = change > SCALAR(0) ? step[k] : -step[k];
+            law[k] += moved[k];
             there = false;
         }
     }
@@ -403,11 +408,13 @@ OWN_FRAME void estimator_step(struct estimator *e, const struct estimator_parame
         e->since_update = 0;
     }
     e->updating = e->since_update < ROW_TURNS;
+    e->law_m_moved = !e->follows_m;
     if (!e->follows_m) {
-        e->follows_m = rate_limit(e->law_m, e->theta_m, constants->step_m, THETA_M);
+        e->follows_m = rate_limit(e->law_m, e->moved_m, e->theta_m, constants->step_m, THETA_M);
     }
     if (!e->follows_h) {
-        e->follows_h = rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
+        scalar moved_h[THETA_H]; /* of no use: what the oil's parameters move is not given back */
+        e->follows_h = rate_limit(e->law_h, moved_h, e->theta_h, constants->step_h, THETA_H);
     }
 }
 

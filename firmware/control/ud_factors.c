@@ -62,9 +62,11 @@ variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, ga
 variance ud_variance(const struct ud_factors *ud, uint8_t k)
 {
     variance sum = ud->D[k];
-    for (uint8_t j = (uint8_t)(k + 1); j < ud->size; j++) {
-        const scalar u = ud->U[column(j) + k];
-        sum = add_variance(sum, scale_variance(scale_variance(ud->D[j], u), u));
+    uint8_t at = (uint8_t)(column((uint8_t)(k + 1u)) + k);
+    for (uint8_t j = (uint8_t)(k + 1u); j < ud->size; j++) {
+        const scalar u = ud->U[at];
+        sum = add_scaled_variance(sum, scale_variance(ud->D[j], u), u);
+        at = (uint8_t)(at + j);
     }
     return sum;
 }
