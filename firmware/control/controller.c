@@ -6,16 +6,10 @@ SELDOM void controller_constants(struct controller_constants *constants, const s
     constants->dt_s = dt_s;
     for (uint8_t i = 0; i < JOINTS; i++) {
         constants->cylinder[i] = cylinder_constants(&machine->cylinder[i]);
+        constants->diarc[i] = diarc_constants(&machine->diarc[i]);
     }
     constants->observer = observer_constants(machine->observer_bandwidth, dt_s);
     estimator_constants(&constants->estimator, &machine->estimator, dt_s);
-}
-
-SELDOM void controller_start(struct controller *controller, const struct machine *machine,
-                             const struct controller_constants *constants)
-{
-    *controller = (struct controller){.kind = CONTROLLER_DIARC};
-    estimator_start(&controller->estimator, &machine->estimator, &constants->estimator);
 }
 
 SELDOM void controller_arm(struct controller *controller, enum controller_kind kind, const scalar q[JOINTS])
@@ -36,6 +30,16 @@ void controller_disarm(struct controller *controller)
     for (uint8_t i = 0; i < JOINTS; i++) {
         controller->output[i] = (struct joint_output){0};
     }
+}
+
+SELDOM void controller_start(struct controller *controller, const struct machine *machine,
+                             const struct controller_constants *constants)
+{
+    /* not as a whole: the estimate, most of it, clears itself */
+    const scalar rest[JOINTS] = {SCALAR(0), SCALAR(0)};
+    controller_arm(controller, CONTROLLER_DIARC, rest);
+    controller_disarm(controller);
+    estimator_start(&controller->estimator, &machine->estimator, &constants->estimator);
 }
 
 void controller_gap(struct controller *controller)
@@ -160,7 +164,7 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
     if (!controller->diarc[i].started) {
         diarc_start(&controller->diarc[i], &machine->diarc[i], &in);
     }
-    const struct diarc_output output = diarc_step(&controller->diarc[i], &machine->diarc[i], &in,
+    const struct diarc_output output = diarc_step(&controller->diarc[i], &machine->diarc[i], &constants->diarc[i], &in,
                                                   constants->dt_s, constants->estimator.per_tick);
     out->saturated = output.saturated;
     return output.u;

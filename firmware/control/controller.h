@@ -33,6 +33,7 @@ struct machine {
 struct controller_constants {
     scalar dt_s;
     struct cylinder_constants cylinder[JOINTS];
+    struct diarc_constants diarc[JOINTS];
     struct observer_constants observer;
     struct estimator_constants estimator;
 };

@@ -22,6 +22,11 @@ struct diarc_gains {
     scalar spool_lead; /* share of the spool's lag behind its set-point that is added to it */
 };
 
+/* What follows from them once. */
+struct diarc_constants {
+    gain per_eta1, per_eta2; /* 1 / (4 eta) */
+};
+
 /* What one joint's law sees at one tick. */
 struct diarc_input {
     scalar e1;                 /* q - qd, rad */
@@ -58,12 +63,15 @@ struct diarc_output {
     bool saturated;
 };
 
+struct diarc_constants diarc_constants(const struct diarc_gains *gains);
+
 /* Bumpless start: gamma1 such that F_Ld is the measured force. gamma2 starts at zero: what the valve then
  * passes at rest is the leakage. */
 void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in);
 
 /* One tick of dt_s; per_tick = 1 / dt_s. */
 struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
-                               const struct diarc_input *in, scalar dt_s, gain per_tick);
+                               const struct diarc_constants *constants, const struct diarc_input *in,
+                               scalar dt_s, gain per_tick);
 
 #endif

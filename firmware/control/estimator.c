@@ -70,12 +70,11 @@ SELDOM static void start_block(const struct prior prior[], uint8_t size, const s
 SELDOM void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
                             const struct estimator_constants *constants)
 {
-    *estimator = (struct estimator){0};
+    *estimator = (struct estimator){.since_update = ROW_TURNS}; /* as estimator_resume leaves it */
     start_block(parameters->m, THETA_M, constants->scale_m, estimator->theta_m, estimator->law_m,
                 &estimator->covariance_m);
     start_block(parameters->h, THETA_H, constants->scale_h, estimator->theta_h, estimator->law_h,
                 &estimator->covariance_h);
-    estimator_resume(estimator);
 }
 
 SELDOM void estimator_commission(struct estimator *estimator)

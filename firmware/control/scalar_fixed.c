@@ -173,7 +173,7 @@ inverse invert(variance v)
     /* the first 15 bits of 2^62 / normal by division, twice as many by Newton, the last ones by what is left over */
     const uint32_t guess = UINT32_MAX / (normal >> 16) << 14;
     const int64_t missing = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * guess);
-    const uint32_t better = guess + (uint32_t)(((missing >> 32) * (int64_t)guess) >> 30);
+    const uint32_t better = guess + (uint32_t)(((missing >> 32) * (int32_t)guess) >> 30);
     const int64_t left = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * better);
     const uint32_t mantissa = better + (uint32_t)(left >> 32);
     return (inverse){.mantissa = mantissa > INT32_MAX ? INT32_MAX : (int32_t)mantissa,

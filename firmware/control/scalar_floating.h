@@ -165,4 +165,9 @@ static inline scalar variance_share(variance v, inverse i)
     return v * i;
 }
 
+static inline scalar variance_part(variance v, inverse i)
+{
+    return v * i;
+}
+
 #endif

@@ -36,7 +36,7 @@ static inline variance update_column(variance *D, scalar Uj[], uint8_t j, const 
     }
     const variance alpha_after = add_scaled_variance(alpha, v, f);
     *alpha_inverse = invert(alpha_after);
-    *D = scale_variance(*D, variance_share(alpha, *alpha_inverse));
+    *D = scale_variance(*D, variance_part(alpha, *alpha_inverse));
     return alpha_after;
 }
 

@@ -79,12 +79,14 @@ static void start(void)
 static struct diarc_output try_out(const struct diarc_input *input)
 {
     struct diarc copy = diarc;
-    return diarc_step(&copy, &gains, input, from_real(DT_S), PER_TICK);
+    const struct diarc_constants constants = diarc_constants(&gains);
+    return diarc_step(&copy, &gains, &constants, input, from_real(DT_S), PER_TICK);
 }
 
 static struct diarc_output step(void)
 {
-    return diarc_step(&diarc, &gains, &in, from_real(DT_S), PER_TICK);
+    const struct diarc_constants constants = diarc_constants(&gains);
+    return diarc_step(&diarc, &gains, &constants, &in, from_real(DT_S), PER_TICK);
 }
 
 /* Spool set-point with the pure feedback of the gains that are left on. */
