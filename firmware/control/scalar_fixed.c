@@ -11,6 +11,8 @@
 #define ARGUMENT_FRACTION 29
 #define COEFFICIENT_FRACTION 30
 #define TERMS 5
+#define ROUNDING_BITS (COEFFICIENT_FRACTION + ARGUMENT_FRACTION - 32 - SCALAR_FRACTION)
+#define ROUNDING_HALF (1 << (ROUNDING_BITS - 1))
 
 static const int32_t SINE[TERMS] = {
     COEFFICIENT(0.999999995698809019),   COEFFICIENT(-0.166666579478460114),
@@ -30,7 +32,8 @@ static scalar odd_polynomial(const int32_t *coefficient, int32_t x)
     for (uint8_t k = TERMS - 1; k > 0; k--) {
         p = (int32_t)(((int64_t)p * y) >> ARGUMENT_FRACTION) + coefficient[k - 1];
     }
-    return fixed_shifted((int64_t)p * x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
+    /* of the product's 59 fraction bits 27 are in its high word; below 2, so there is nothing to limit */
+    return ((int32_t)(((int64_t)p * x) >> 32) + ROUNDING_HALF) >> ROUNDING_BITS;
 }
 
 /* |x| <= pi/2 */
@@ -123,7 +126,7 @@ scalar quot(scalar a, scalar b)
 
 scalar fraction(uint32_t part, uint32_t whole)
 {
-    return (scalar)divide((uint64_t)part << SCALAR_FRACTION, whole);
+    return variance_part((variance)part, invert((variance)whole));
 }
 
 /* floor(sqrt(x)), 2^30 <= x. The upper 8 bits by Newton from a line, the lower from the remainder, as in long division:
@@ -197,15 +200,17 @@ scalar fixed_from_raw(int32_t raw, uint8_t fraction_bits)
 
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high)
 {
-    /* half away from zero: the magnitude is rounded half up */
-    const int64_t magnitude =
-        ((int64_t)absolute(x) * ((int64_t)1 << fraction_bits) + ((int64_t)1 << (SCALAR_FRACTION - 1))) >>
-        SCALAR_FRACTION;
-    const int64_t raw = x < 0 ? -magnitude : magnitude;
-    if (raw < low) {
-        return low;
+    if (fraction_bits >= SCALAR_FRACTION) {
+        const int64_t raw = (int64_t)x * ((int64_t)1 << (fraction_bits - SCALAR_FRACTION));
+        if (raw < low) {
+            return low;
+        }
+        return raw > high ? high : (int32_t)raw;
     }
-    return raw > high ? high : (int32_t)raw;
+    /* half away from zero: the magnitude is rounded half up */
+    const uint8_t shift = (uint8_t)(SCALAR_FRACTION - fraction_bits);
+    const int32_t magnitude = (int32_t)((magnitude_of(x) + ((uint32_t)1 << (shift - 1))) >> shift);
+    return limit(x < 0 ? -magnitude : magnitude, low, high);
 }
 
 /* binary32 times 2^(fraction - exponent), rounded; parameters may use the whole word. */

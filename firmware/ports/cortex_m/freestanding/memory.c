@@ -52,7 +52,10 @@ void *memset(void *to, int value, size_t count)
 {
     const uint8_t byte = (uint8_t)value;
     uint8_t *t = to;
-    if (aligned(to)) {
+    for (; count > 0u && !aligned(t); count--) {
+        *t++ = byte;
+    }
+    if (count > 0u) {
         const word bytes = (word)byte * 0x01010101u;
         /* eight at a time: a reset clears more than 1 kB within a tick */
         for (; count >= 8u * sizeof(word); count -= 8u * sizeof(word)) {
