@@ -327,9 +327,6 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
         residual -= mul(column, e->theta_m[parameter]);
         phi[parameter] = mul(column, constants->scale_m[parameter]);
     }
-    if (!e->commissioning) {
-        walk(e, constants);
-    }
     const variance innovation = update_block(&e->covariance_m, phi, constants->noise_m[i], residual,
                                              constants->scale_m, parameters->m, e->theta_m);
     if (!e->commissioning) {
@@ -403,6 +400,9 @@ OWN_FRAME void estimator_step(struct estimator *e, const struct estimator_parame
         } else {
             update_hydraulics(e, parameters, constants, i);
             e->follows_h = false;
+            if (!e->commissioning) {
+                walk(e, constants); /* of the mechanics' estimate, as many as theirs, when there is time for it */
+            }
         }
         e->since_update = 0;
     }

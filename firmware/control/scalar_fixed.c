@@ -185,9 +185,14 @@ inverse invert(variance v)
 
 inverse scale_inverse(inverse i, scalar f)
 {
-    const uint8_t bits = f == 0 ? 0u : (uint8_t)(32u - leading_zeros(magnitude_of(f)));
-    const int32_t shift = i.shift + bits - SCALAR_FRACTION;
-    return (inverse){.mantissa = (int32_t)(((int64_t)i.mantissa * f) >> bits),
+    if (f == 0) {
+        return (inverse){.mantissa = 0, .shift = 0};
+    }
+    /* f is normalised, so that the high word of the product has its first bits */
+    const uint8_t zeros = (uint8_t)(leading_zeros(magnitude_of(f)) - 1u);
+    const int32_t normal = f * ((int32_t)1 << zeros);
+    const int32_t shift = i.shift + 32 - SCALAR_FRACTION - zeros;
+    return (inverse){.mantissa = (int32_t)(((int64_t)i.mantissa * normal) >> 32),
                      .shift = (int8_t)(shift < INVERSE_SHIFT_MOST ? shift : INVERSE_SHIFT_MOST)};
 }
 
