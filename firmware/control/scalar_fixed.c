@@ -44,6 +44,13 @@ static inline scalar sine_quarter(scalar x)
 
 #include "control/scalar_sine.inc"
 
+/* part / whole as an argument, |part| <= whole. */
+static int32_t part_of(scalar part, scalar whole)
+{
+    const int32_t ratio = (int32_t)(fixed_part(absolute(part), invert(whole)) >> (30 - ARGUMENT_FRACTION));
+    return part < 0 ? -ratio : ratio;
+}
+
 scalar arctangent(scalar y, scalar x)
 {
     const scalar a = absolute(y);
@@ -51,12 +58,12 @@ scalar arctangent(scalar y, scalar x)
     int32_t ratio;
     if (mul(a, TAN_PI_8) > x) {
         offset = HALF_PI;
-        ratio = -fixed_quotient(x, a, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = -part_of(x, a);
     } else if (a > mul(x, TAN_PI_8)) {
         offset = QUARTER_PI;
-        ratio = fixed_quotient(a - x, a + x, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = part_of(a - x, a + x);
     } else {
-        ratio = fixed_quotient(a, x, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = part_of(a, x);
     }
     const scalar angle = offset + odd_polynomial(ARCTANGENT, ratio);
     return y < SCALAR(0) ? -angle : angle;

@@ -233,11 +233,18 @@ static inline scalar variance_share(variance v, inverse i)
     return fixed_scaled(v, i.mantissa, 62 - SCALAR_FRACTION - i.shift);
 }
 
-/* v over w, of which i is the inverse itself, for 0 <= v <= w: with that known it takes no more than a product. */
-static inline scalar variance_part(variance v, inverse i)
+/* v over w, of which i is the inverse itself, for 0 <= v <= w, with 30 fraction bits: with that known it takes no more
+ * than a product. */
+static inline uint32_t fixed_part(int32_t v, inverse i)
 {
     const uint64_t product = (uint64_t)((uint32_t)v << i.shift) * (uint32_t)i.mantissa; /* 62 fraction bits */
-    return (scalar)(((uint32_t)(product >> 32) + (1u << (29 - SCALAR_FRACTION))) >> (30 - SCALAR_FRACTION));
+    return (uint32_t)(product >> 32);
+}
+
+/* The same as a scalar. */
+static inline scalar variance_part(variance v, inverse i)
+{
+    return (scalar)((fixed_part(v, i) + (1u << (29 - SCALAR_FRACTION))) >> (30 - SCALAR_FRACTION));
 }
 
 #endif
