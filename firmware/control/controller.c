@@ -47,20 +47,22 @@ void controller_gap(struct controller *controller)
     estimator_resume(&controller->estimator);
 }
 
-/* What estimator and law both need of a joint's valve and cylinder; its roots are taken once. */
+/* What estimator and law both need of a joint's valve and cylinder; its roots are taken once where both look at the
+ * same side of the valve, as they mostly do. */
 struct joint_flow {
-    scalar gain_extending; /* QL per unit opening */
-    scalar gain_retracting;
+    bool extending; /* the side that is open */
+    scalar gain;    /* QL per unit opening to that side */
     scalar leakage; /* m^2/s */
 };
 
 static struct joint_flow joint_flow(const struct machine *machine, enum joint i,
-                                    const struct cylinder_state *state, const scalar p[CHAMBERS])
+                                    const struct cylinder_state *state, const scalar p[CHAMBERS],
+                                    bool extending)
 {
     const struct cylinder *const cylinder = &machine->cylinder[i];
     return (struct joint_flow){
-        .gain_extending = valve_gain(cylinder, &machine->supply, state, p, true),
-        .gain_retracting = valve_gain(cylinder, &machine->supply, state, p, false),
+        .extending = extending,
+        .gain = valve_gain(cylinder, &machine->supply, state, p, extending),
         .leakage = cylinder_leakage(cylinder, state, p),
     };
 }
@@ -83,9 +85,8 @@ OWN_FRAME static void take_sample(const struct controller *controller, const str
                                ? mul(sample->cylinder[i].R, constants->cylinder[i].lever_inverse)
                                : SCALAR(1);
         const scalar opening = valve_opening(cylinder, measured->spool[i]);
-        flow[i] = joint_flow(machine, (enum joint)i, &sample->cylinder[i], p);
-        const scalar valve = opening >= SCALAR(0) ? flow[i].gain_extending : flow[i].gain_retracting;
-        sample->flow[i] = mul(opening, valve) - flow[i].leakage;
+        flow[i] = joint_flow(machine, (enum joint)i, &sample->cylinder[i], p, opening >= SCALAR(0));
+        sample->flow[i] = mul(opening, flow[i].gain) - flow[i].leakage;
     }
 }
 
@@ -129,8 +130,9 @@ static scalar torque_step(const struct controller *controller, const struct arm_
 
 static scalar diarc_joint(struct controller *controller, const struct machine *machine,
                           const struct controller_constants *constants, const struct estimator_sample *sample,
-                          const struct joint_flow *flow, enum joint i, const scalar theta[THETA_M],
-                          const struct wrist_trig *desired, scalar beta_share, struct joint_output *out)
+                          const struct joint_flow *flow, const scalar p[CHAMBERS], enum joint i,
+                          const scalar theta[THETA_M], const struct wrist_trig *desired, scalar beta_share,
+                          struct joint_output *out)
 {
     const scalar w[JOINTS] = {controller->output[SWING].reference.w, controller->output[WRIST].reference.w};
     const scalar a[JOINTS] = {controller->output[SWING].reference.a, controller->output[WRIST].reference.a};
@@ -158,14 +160,19 @@ static scalar diarc_joint(struct controller *controller, const struct machine *m
         .cylinder = *c,
         .force = sample->force[i],
         .leakage = flow->leakage,
-        .gain_extending = flow->gain_extending,
-        .gain_retracting = flow->gain_retracting,
     };
     if (!controller->diarc[i].started) {
         diarc_start(&controller->diarc[i], &machine->diarc[i], &in);
     }
-    const struct diarc_output output = diarc_step(&controller->diarc[i], &machine->diarc[i], &constants->diarc[i], &in,
-                                                  constants->dt_s, constants->estimator.per_tick);
+    const struct diarc_gains *const gains = &machine->diarc[i];
+    const struct diarc_steps steps =
+        diarc_flow(&controller->diarc[i], gains, &constants->diarc[i], &in, constants->estimator.per_tick);
+    const bool extend = steps.Q_Ld >= SCALAR(0);
+    const scalar QL_gain = extend == flow->extending
+                               ? flow->gain
+                               : valve_gain(&machine->cylinder[i], &machine->supply, c, p, extend);
+    const struct diarc_output output =
+        diarc_opening(&controller->diarc[i], gains, &in, &steps, QL_gain, constants->dt_s);
     out->saturated = output.saturated;
     return output.u;
 }
@@ -217,8 +224,8 @@ OWN_FRAME static void diarc_law(struct controller *controller, const struct mach
         quot(constants->estimator.scale_h[BETA_INVERSE], controller->estimator.law_h[BETA_INVERSE]);
     for (uint8_t i = 0; i < JOINTS; i++) {
         struct joint_output *const out = &controller->output[i];
-        const scalar u = diarc_joint(controller, machine, constants, sample, &flow[i], (enum joint)i, theta,
-                                     &desired, beta_share, out);
+        const scalar u = diarc_joint(controller, machine, constants, sample, &flow[i], measured->p[i],
+                                     (enum joint)i, theta, &desired, beta_share, out);
         /* the set-point leads by a share of the spool's measured lag */
         const scalar spool = valve_spool(&machine->cylinder[i], u);
         const scalar lead = mul(machine->diarc[i].spool_lead, spool - measured->spool[i]);

@@ -41,10 +41,13 @@ struct diarc_input {
     scalar flow_offset;        /* d^ = lamB Om2^ + lamC Om3^, m^2/s */
     scalar flow_uncertainty;   /* |d_max - d_min|, m^2/s */
     struct cylinder_state cylinder;
-    scalar force;          /* F, N */
-    scalar leakage;        /* m^2/s */
-    scalar gain_extending; /* QL per unit spool for u >= 0 and u < 0 */
-    scalar gain_retracting;
+    scalar force;   /* F, N */
+    scalar leakage; /* m^2/s */
+};
+
+/* Both steps' results; Q_Ld is what the valve is to pass, m^2/s. */
+struct diarc_steps {
+    scalar e2, F_Ld, e3, Q_Ld;
 };
 
 struct diarc {
@@ -69,9 +72,13 @@ struct diarc_constants diarc_constants(const struct diarc_gains *gains);
  * passes at rest is the leakage. */
 void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in);
 
-/* One tick of dt_s; per_tick = 1 / dt_s. */
-struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
-                               const struct diarc_constants *constants, const struct diarc_input *in,
-                               scalar dt_s, gain per_tick);
+/* One tick of dt_s in two parts, because the valve's gain depends on which way the flow is wanted: the flow, per_tick =
+ * 1 / dt_s, and then the set-point that QL_gain, QL per unit opening to that side, makes of it. */
+struct diarc_steps diarc_flow(struct diarc *diarc, const struct diarc_gains *gains,
+                              const struct diarc_constants *constants, const struct diarc_input *in,
+                              gain per_tick);
+struct diarc_output diarc_opening(struct diarc *diarc, const struct diarc_gains *gains,
+                                  const struct diarc_input *in, const struct diarc_steps *steps,
+                                  scalar QL_gain, scalar dt_s);
 
 #endif

@@ -141,8 +141,8 @@ static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
 }
 
 /* The same of step / T + x, with pole_rate = pole_step / T. */
-static void low_pass_rate(struct two_poles *filter, scalar *sum, scalar pole_step, gain pole_rate, scalar step,
-                          scalar x)
+static void low_pass_rate(struct two_poles *filter, scalar *sum, scalar pole_step, gain pole_rate,
+                          scalar step, scalar x)
 {
     *sum += step - mul(pole_step, *sum);
     filter->first += mul(pole_step, x - filter->first);
@@ -220,8 +220,9 @@ OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estima
             low_pass_rate(&m->column[k], &m->step[k], constants->filter, constants->filter_rate,
                           mul(g, momentum.phi[k] - before->phi[k]), mul(g, force.phi[k]));
         }
-        low_pass_rate(&m->column[ROW_COLUMNS], &m->step[ROW_COLUMNS], constants->filter, constants->filter_rate,
-                      mul(g, momentum.known - before->known), mul(g, force.known - torque));
+        low_pass_rate(&m->column[ROW_COLUMNS], &m->step[ROW_COLUMNS], constants->filter,
+                      constants->filter_rate, mul(g, momentum.known - before->known),
+                      mul(g, force.known - torque));
     }
     m->momentum = momentum;
     m->w[SWING] = w[SWING];
@@ -250,8 +251,8 @@ OWN_FRAME static void hydraulics_balance(struct estimator *e, const struct estim
         const scalar w = amp(constants->per_tick, now->dq[i]);
         const scalar displaced = mul(mul(half, h->lamA_R + lamA_R), w);
         const scalar flow = mul(half, h->flow + now->flow[i]);
-        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate, mul(g, now->force[i] - h->force),
-                      SCALAR(0));
+        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate,
+                      mul(g, now->force[i] - h->force), SCALAR(0));
         low_pass(&h->column[1], filter, -mul(g, mul(half, h->lamB + cylinder->lamB)));
         low_pass(&h->column[2], filter, -mul(g, mul(half, h->lamC + cylinder->lamC)));
         low_pass(&h->column[3], filter, mul(g, displaced - flow));
@@ -401,7 +402,9 @@ OWN_FRAME void estimator_step(struct estimator *e, const struct estimator_parame
             update_hydraulics(e, parameters, constants, i);
             e->follows_h = false;
             if (!e->commissioning) {
-                walk(e, constants); /* of the mechanics' estimate, as many as theirs, when there is time for it */
+                walk(
+                    e,
+                    constants); /* of the mechanics' estimate, as many as theirs, when there is time for it */
             }
         }
         e->since_update = 0;

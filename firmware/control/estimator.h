@@ -135,7 +135,7 @@ struct estimator {
     scalar theta_h[THETA_H];
     scalar law_m[THETA_M]; /* what the law sees: rate limited */
     scalar law_h[THETA_H];
-    scalar moved_m[THETA_M]; /* by how much law_m did in the last tick, while law_m_moved */
+    scalar moved_m[THETA_M];        /* by how much law_m did in the last tick, while law_m_moved */
     struct ud_factors covariance_m; /* in units of the ranges */
     struct ud_factors covariance_h;
     struct window window;

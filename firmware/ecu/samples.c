@@ -114,8 +114,7 @@ static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *
         return missing(ecu, RX_ENCODERS);
     }
     struct diarc_encoders_t raw;
-    const int done =
-        diarc_encoders_unpack(&raw, ecu->receive.row[RX_ENCODERS].data, DIARC_ENCODERS_LENGTH);
+    const int done = diarc_encoders_unpack(&raw, ecu->receive.row[RX_ENCODERS].data, DIARC_ENCODERS_LENGTH);
     if (done != 0 || raw.sensor_status == SENSOR_STATUS_INVALID || raw.swing_angle == WIRE_INVALID_S24 ||
         raw.wrist_angle == WIRE_INVALID_S24) {
         return FAULT_SENSOR_INVALID;
