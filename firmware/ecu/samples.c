@@ -15,6 +15,7 @@ static scalar angle_of(int32_t raw)
 
 /* A raw pressure has 16 bits: it is a share of what 2^16 steps are. */
 #define PRESSURE_BITS 16
+#define PRESSURE_FULL 65536
 
 static scalar pressure_of(const struct ecu *ecu, uint16_t raw)
 {
@@ -36,8 +37,7 @@ void samples_start(struct ecu *ecu)
     const struct machine *const machine = &ecu->machine;
     const struct limits *const limits = &machine->limits;
     struct sample_limits *const raw = &ecu->sample_limits;
-    ecu->full_pressure =
-        WIRE_DECODE(1 << PRESSURE_BITS, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure);
+    ecu->full_pressure = WIRE_DECODE(PRESSURE_FULL, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure);
     for (uint8_t i = 0; i < JOINTS; i++) {
         raw->angle_low[i] = raw_angle(machine->cylinder[i].q_min - limits->angle_range);
         raw->angle_high[i] = raw_angle(machine->cylinder[i].q_max + limits->angle_range);
