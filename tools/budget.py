@@ -213,6 +213,25 @@ class CallGraph:
             if name not in known:
                 self.frame[name] = max(self.frame.get(name, 0), _pushed(name, body))
 
+    def add_aliases(self, symbols: list[tuple[int, str, str]]) -> None:
+        """Know a function by all of its names: of functions with the same code the linker's compiler keeps one.
+
+        Parameters
+        ----------
+        symbols : list
+            Address, kind and name of each of the image's symbols.
+        """
+        names: dict[int, list[str]] = {}
+        for address, kind, name in symbols:
+            if kind in "tTwW":
+                names.setdefault(address, []).append(_function(name))
+        for same in names.values():
+            known = [name for name in same if name in self.frame]
+            for name in same:
+                if known and name not in self.frame:
+                    self.frame[name] = self.frame[known[0]]
+                    self.calls[name] = set(self.calls.get(known[0], ()))
+
     def resolve(self, targets: dict[str, str]) -> None:
         """Replace calls through the port's pointers by calls of what is in them.
 
@@ -260,8 +279,8 @@ class CallGraph:
 
 
 def _function(title: str) -> str:
-    """Name without the file before it, and without what the linker's --wrap has before the function it wraps."""
-    return title.rsplit(":", 1)[-1].removeprefix("__real_")
+    """Name without the file before it."""
+    return title.rsplit(":", 1)[-1]
 
 
 def _pushed(name: str, body: str) -> int:
@@ -286,7 +305,11 @@ def call_graph(elf: Path) -> CallGraph:
     """The graph of an image that was built with GRAPH."""
     graph = CallGraph()
     commands = json.loads((elf.parent / "compile_commands.json").read_text(encoding="utf-8"))
-    sources = {str(Path(command["file"]).resolve()) for command in commands}
+    sources = {str(Path(command["file"]).resolve()) for command in commands if not _linked_as_one(command["command"])}
+    for path in sorted(elf.parent.glob(f"{elf.name}.ltrans*.ci")):
+        graph.add_compiler(path.read_text(encoding="utf-8"))
+    if len(sources) < len(commands) and not graph.frame:
+        raise BudgetError(f"no call graph of what the linker compiled for {elf.name}")
     for path in sorted(elf.parent.rglob("*.ci")):
         text = path.read_text(encoding="utf-8")
         title = re.match(r'graph: \{ title: "([^"]*)"', text)
@@ -296,8 +319,16 @@ def call_graph(elf: Path) -> CallGraph:
     if sources:
         raise BudgetError(f"no call graph of {', '.join(sorted(sources))}")
     graph.add_machine_code(tool("objdump", "-d", "--no-show-raw-insn", str(elf)))
-    graph.resolve(port_functions(elf))
+    graph.add_aliases(_symbols(elf))
+    if graph.pointers:  # where there are none the compiler has put the port's functions in their places
+        graph.resolve(port_functions(elf))
     return graph
+
+
+def _linked_as_one(command: str) -> bool:
+    """Whether this command leaves the compiling to the linker, which then says what calls what."""
+    flags = [word for word in command.split() if word in ("-flto", "-fno-lto")]
+    return flags[-1:] == ["-flto"]
 
 
 def _symbols(elf: Path) -> list[tuple[int, str, str]]:
@@ -557,8 +588,9 @@ def document_part(measured: dict[str, Measured]) -> str:
             "  linker script sets 4096 bytes aside for the stack besides.\n"
             "- **Stack** is the deepest path of the call graph from `reset`, plus the registers that the processor\n"
             "  pushes and the deepest interrupt. Frames are the compiler's (`-fcallgraph-info=su`), those of libgcc\n"
-            "  are read from the machine code. Calls through pointers are the port's three, resolved from what the\n"
-            "  image has in `the_port`. Recursion, a frame that is not constant, or any other pointer is an error.\n"
+            "  are read from the machine code. Calls through pointers are the port's three: the compiler sees the\n"
+            "  whole image and makes direct ones of them, or else they are resolved from what is in `the_port`.\n"
+            "  Recursion, a frame that is not constant, or any other pointer is an error.\n"
             "- **Instructions** are of every tick from the opening of the channel on, in every mode.\n"
             f"  Counted in QEMU over {runs}\n"
             f"  ({loads}); the mean is of the first run, the maximum of all ticks of all.\n"
@@ -573,7 +605,7 @@ def document_part(measured: dict[str, Measured]) -> str:
             markdown(["", *presets], stage_rows(measured)),
             "`receive`, `send` and `UART` are mostly SLCAN text. `estimate` is `estimator_step`, `control` the\n"
             "rest of `controller_step`: reference, observer, cylinder geometry, law. The image that counts is the\n"
-            "same code, linked with `--wrap` around these two.",
+            "same code; a function that measures is called in front of each of these two.",
             "The deepest paths:\n\n" + "\n".join(paths),
             "What the arithmetic needs, in operations a tick, counted by hand in `tools/budget_floor.py`; no loads,\n"
             "stores, calls or comparisons:",

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 JOINTS = 2
-BALANCED = 0.25  # of the ticks balance a joint's rows: one window of the estimator is four ticks
+BALANCED = 0.25  # of the ticks balance a joint's mechanics: one window of the estimator is four ticks
 THETA_M, THETA_H = 9, 5
 # row_parameter in arm_model.c and hydraulic_parameter in estimator.c: where a row's columns are in theta
 MECHANICS = ((0, 1, 2, 3, 5, 7), (0, 1, 2, 4, 6, 8))
@@ -98,7 +98,7 @@ def terms() -> list[tuple[str, Operations]]:
         ("sine and cosine: wrist measured and wanted, two triangles", 8 * (polynomial(TERMS) + Operations(add=1))),
         ("radius of the tip, measured and wanted", 2 * Operations(mul=1, add=1)),
         ("cylinder: length, lever, volumes", JOINTS * Operations(mul=6, add=7, div=3, root=1)),
-        ("force, flow, leakage, valve gain of both signs", JOINTS * Operations(mul=12, add=11, root=4)),
+        ("force, flow, leakage, valve gain of one sign", JOINTS * Operations(mul=9, add=8, root=2)),
         ("samples of the window", JOINTS * Operations(mul=3)),
         (
             "windows: rates, trigonometry, mean torque",
@@ -111,7 +111,7 @@ def terms() -> list[tuple[str, Operations]]:
         ("gate and its filter", BALANCED * JOINTS * (LOW_PASS + Operations(mul=2, add=1)) + Operations(add=1)),
         (
             "hydraulic rows and their filters",
-            BALANCED * JOINTS * (Operations(mul=10, add=12, div=1) + with_rate + 3 * plain),
+            JOINTS * (Operations(mul=10, add=12, div=1) + with_rate + 3 * plain),  # every tick
         ),
         ("update of one row of four in turn, mean: residual, UD factors, theta", mean_row),
         ("rate limit of the estimate", (THETA_M + THETA_H) * Operations(add=2)),

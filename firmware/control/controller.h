@@ -33,6 +33,7 @@ struct machine {
 struct controller_constants {
     scalar dt_s;
     struct cylinder_constants cylinder[JOINTS];
+    struct diarc_constants diarc[JOINTS];
     struct observer_constants observer;
     struct estimator_constants estimator;
 };
@@ -61,11 +62,11 @@ struct controller {
     struct estimator estimator;
     struct diarc diarc[JOINTS];
     struct pid pid[JOINTS];
-    scalar law_m_before[THETA_M]; /* the law's estimate of the tick before */
     struct joint_output output[JOINTS];
 };
 
-struct controller_constants controller_constants(const struct machine *machine, scalar dt_s);
+/* Where they are kept: too many to pass them as a value. */
+void controller_constants(struct controller_constants *constants, const struct machine *machine, scalar dt_s);
 
 /* Disarmed, estimate at the priors. */
 void controller_start(struct controller *controller, const struct machine *machine,

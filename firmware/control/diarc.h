@@ -22,6 +22,11 @@ struct diarc_gains {
     scalar spool_lead; /* share of the spool's lag behind its set-point that is added to it */
 };
 
+/* What follows from them once. */
+struct diarc_constants {
+    gain per_eta1, per_eta2; /* 1 / (4 eta) */
+};
+
 /* What one joint's law sees at one tick. */
 struct diarc_input {
     scalar e1;                 /* q - qd, rad */
@@ -36,10 +41,13 @@ struct diarc_input {
     scalar flow_offset;        /* d^ = lamB Om2^ + lamC Om3^, m^2/s */
     scalar flow_uncertainty;   /* |d_max - d_min|, m^2/s */
     struct cylinder_state cylinder;
-    scalar force;          /* F, N */
-    scalar leakage;        /* m^2/s */
-    scalar gain_extending; /* QL per unit spool for u >= 0 and u < 0 */
-    scalar gain_retracting;
+    scalar force;   /* F, N */
+    scalar leakage; /* m^2/s */
+};
+
+/* Both steps' results; Q_Ld is what the valve is to pass, m^2/s. */
+struct diarc_steps {
+    scalar e2, F_Ld, e3, Q_Ld;
 };
 
 struct diarc {
@@ -58,12 +66,19 @@ struct diarc_output {
     bool saturated;
 };
 
+struct diarc_constants diarc_constants(const struct diarc_gains *gains);
+
 /* Bumpless start: gamma1 such that F_Ld is the measured force. gamma2 starts at zero: what the valve then
  * passes at rest is the leakage. */
 void diarc_start(struct diarc *diarc, const struct diarc_gains *gains, const struct diarc_input *in);
 
-/* One tick of dt_s; per_tick = 1 / dt_s. */
-struct diarc_output diarc_step(struct diarc *diarc, const struct diarc_gains *gains,
-                               const struct diarc_input *in, scalar dt_s, gain per_tick);
+/* One tick of dt_s in two parts, because the valve's gain depends on which way the flow is wanted: the flow, per_tick =
+ * 1 / dt_s, and then the set-point that QL_gain, QL per unit opening to that side, makes of it. */
+struct diarc_steps diarc_flow(struct diarc *diarc, const struct diarc_gains *gains,
+                              const struct diarc_constants *constants, const struct diarc_input *in,
+                              gain per_tick);
+struct diarc_output diarc_opening(struct diarc *diarc, const struct diarc_gains *gains,
+                                  const struct diarc_input *in, const struct diarc_steps *steps,
+                                  scalar QL_gain, scalar dt_s);
 
 #endif

@@ -14,35 +14,34 @@ static const uint8_t hydraulic_parameter[JOINTS][HYDRAULIC_COLUMNS] = {
     [WRIST] = {BETA_INVERSE, OM2_WRIST, OM3_WRIST},
 };
 
-SELDOM struct estimator_constants estimator_constants(const struct estimator_parameters *parameters,
-                                                      scalar dt_s)
+SELDOM void estimator_constants(struct estimator_constants *constants,
+                                const struct estimator_parameters *parameters, scalar dt_s)
 {
-    struct estimator_constants constants = {0};
     const scalar window_s = mul(dt_s, SCALAR(ROW_TURNS));
-    constants.filter = quot(window_s, parameters->filter_time + window_s);
-    constants.filter_rate = gain_quot(constants.filter, window_s);
-    constants.tick_filter = quot(dt_s, parameters->filter_time + dt_s);
-    constants.tick_filter_rate = gain_quot(constants.tick_filter, dt_s);
-    constants.per_tick = gain_quot(SCALAR(1), dt_s);
-    constants.per_window = gain_quot(SCALAR(1), window_s);
-    constants.per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
+    constants->filter = quot(window_s, parameters->filter_time + window_s);
+    constants->filter_rate = gain_quot(constants->filter, window_s);
+    constants->tick_filter = quot(dt_s, parameters->filter_time + dt_s);
+    constants->tick_filter_rate = gain_quot(constants->tick_filter, dt_s);
+    constants->per_tick = gain_quot(SCALAR(1), dt_s);
+    constants->per_window = gain_quot(SCALAR(1), window_s);
+    constants->per_gate_rate = gain_quot(SCALAR(1), parameters->gate_rate);
     for (uint8_t i = 0; i < JOINTS; i++) {
-        constants.noise_m[i] = variance_of(parameters->torque_noise[i]);
-        constants.noise_h[i] = variance_of(parameters->flow_noise[i]);
+        constants->noise_m[i] = variance_of(parameters->torque_noise[i]);
+        constants->noise_h[i] = variance_of(parameters->flow_noise[i]);
     }
     for (uint8_t k = 0; k < THETA_M; k++) {
-        constants.scale_m[k] = parameters->m[k].high - parameters->m[k].low;
-        constants.step_m[k] = mul(constants.scale_m[k], amp(parameters->rate_limit, dt_s));
+        constants->scale_m[k] = parameters->m[k].high - parameters->m[k].low;
+        constants->step_m[k] = mul(constants->scale_m[k], amp(parameters->rate_limit, dt_s));
     }
     for (uint8_t k = 0; k < THETA_H; k++) {
-        constants.scale_h[k] = parameters->h[k].high - parameters->h[k].low;
-        constants.step_h[k] = mul(constants.scale_h[k], amp(parameters->rate_limit, dt_s));
+        constants->scale_h[k] = parameters->h[k].high - parameters->h[k].low;
+        constants->step_h[k] = mul(constants->scale_h[k], amp(parameters->rate_limit, dt_s));
     }
     /* two updates, one per row of the mechanics, every ROW_TURNS ticks */
     const scalar walk_s = mul(dt_s, SCALAR(WALK_UPDATES * ROW_TURNS / 2));
-    constants.walk = scale_variance(variance_of(quot(parameters->load_walk, constants.scale_m[M_T])), walk_s);
-    constants.load_variance = variance_of(quot(parameters->m[M_T].sd, constants.scale_m[M_T]));
-    return constants;
+    constants->walk =
+        scale_variance(variance_of(quot(parameters->load_walk, constants->scale_m[M_T])), walk_s);
+    constants->load_variance = variance_of(quot(parameters->m[M_T].sd, constants->scale_m[M_T]));
 }
 
 /* Commissioning knows a parameter to a quarter of its range. */
@@ -71,12 +70,11 @@ SELDOM static void start_block(const struct prior prior[], uint8_t size, const s
 SELDOM void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,
                             const struct estimator_constants *constants)
 {
-    *estimator = (struct estimator){0};
+    *estimator = (struct estimator){.since_update = ROW_TURNS}; /* as estimator_resume leaves it */
     start_block(parameters->m, THETA_M, constants->scale_m, estimator->theta_m, estimator->law_m,
                 &estimator->covariance_m);
     start_block(parameters->h, THETA_H, constants->scale_h, estimator->theta_h, estimator->law_h,
                 &estimator->covariance_h);
-    estimator_resume(estimator);
 }
 
 SELDOM void estimator_commission(struct estimator *estimator)
@@ -113,11 +111,13 @@ SELDOM static void start_filters(struct estimator *estimator)
         struct hydraulics *const h = &estimator->hydraulics[i];
         for (uint8_t k = 0; k <= ROW_COLUMNS; k++) {
             m->column[k] = (struct two_poles){0};
+            m->step[k] = SCALAR(0);
         }
         for (uint8_t k = 0; k <= HYDRAULIC_COLUMNS; k++) {
             h->column[k] = (struct two_poles){0};
         }
         m->open = (struct two_poles){0};
+        h->step = SCALAR(0);
         m->gate = SCALAR(0);
         h->gate = SCALAR(0);
         m->strikes = 0;
@@ -141,11 +141,12 @@ static void low_pass(struct two_poles *filter, scalar pole_step, scalar x)
 }
 
 /* The same of step / T + x, with pole_rate = pole_step / T. */
-static void low_pass_rate(struct two_poles *filter, scalar pole_step, gain pole_rate, scalar step, scalar x)
+static void low_pass_rate(struct two_poles *filter, scalar *sum, scalar pole_step, gain pole_rate,
+                          scalar step, scalar x)
 {
-    filter->step += step - mul(pole_step, filter->step);
+    *sum += step - mul(pole_step, *sum);
     filter->first += mul(pole_step, x - filter->first);
-    const scalar first = filter->first + amp(pole_rate, filter->step);
+    const scalar first = filter->first + amp(pole_rate, *sum);
     filter->second += mul(pole_step, first - filter->second);
 }
 
@@ -216,11 +217,12 @@ OWN_FRAME static void mechanics_balance(struct estimator *e, const struct estima
         const scalar g = m->gate;
         low_pass(&m->open, constants->filter, g);
         for (uint8_t k = 0; k < ROW_COLUMNS; k++) {
-            low_pass_rate(&m->column[k], constants->filter, constants->filter_rate,
+            low_pass_rate(&m->column[k], &m->step[k], constants->filter, constants->filter_rate,
                           mul(g, momentum.phi[k] - before->phi[k]), mul(g, force.phi[k]));
         }
-        low_pass_rate(&m->column[ROW_COLUMNS], constants->filter, constants->filter_rate,
-                      mul(g, momentum.known - before->known), mul(g, force.known - torque));
+        low_pass_rate(&m->column[ROW_COLUMNS], &m->step[ROW_COLUMNS], constants->filter,
+                      constants->filter_rate, mul(g, momentum.known - before->known),
+                      mul(g, force.known - torque));
     }
     m->momentum = momentum;
     m->w[SWING] = w[SWING];
@@ -249,13 +251,13 @@ OWN_FRAME static void hydraulics_balance(struct estimator *e, const struct estim
         const scalar w = amp(constants->per_tick, now->dq[i]);
         const scalar displaced = mul(mul(half, h->lamA_R + lamA_R), w);
         const scalar flow = mul(half, h->flow + now->flow[i]);
-        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, mul(g, now->force[i] - h->force),
-                      SCALAR(0));
+        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate,
+                      mul(g, now->force[i] - h->force), SCALAR(0));
         low_pass(&h->column[1], filter, -mul(g, mul(half, h->lamB + cylinder->lamB)));
         low_pass(&h->column[2], filter, -mul(g, mul(half, h->lamC + cylinder->lamC)));
         low_pass(&h->column[3], filter, mul(g, displaced - flow));
     } else {
-        low_pass_rate(&h->column[0], filter, constants->tick_filter_rate, SCALAR(0), SCALAR(0));
+        low_pass_rate(&h->column[0], &h->step, filter, constants->tick_filter_rate, SCALAR(0), SCALAR(0));
         for (uint8_t k = 1; k <= HYDRAULIC_COLUMNS; k++) {
             low_pass(&h->column[k], filter, SCALAR(0));
         }
@@ -326,9 +328,6 @@ static void update_mechanics(struct estimator *e, const struct estimator_paramet
         residual -= mul(column, e->theta_m[parameter]);
         phi[parameter] = mul(column, constants->scale_m[parameter]);
     }
-    if (!e->commissioning) {
-        walk(e, constants);
-    }
     const variance innovation = update_block(&e->covariance_m, phi, constants->noise_m[i], residual,
                                              constants->scale_m, parameters->m, e->theta_m);
     if (!e->commissioning) {
@@ -359,24 +358,26 @@ static void update_hydraulics(struct estimator *e, const struct estimator_parame
 }
 
 /* sat_M: the law's estimate follows by at most `step` a tick. True when it is there. */
-static bool rate_limit(scalar law[], const scalar theta[], const scalar step[], uint8_t size)
+static bool rate_limit(scalar law[], scalar moved[], const scalar theta[], const scalar step[], uint8_t size)
 {
     bool there = true;
     for (uint8_t k = 0; k < size; k++) {
         const scalar change = theta[k] - law[k];
         if (absolute(change) <= step[k]) {
+            moved[k] = change;
             law[k] = theta[k];
         } else {
-            law[k] += change > SCALAR(0) ? step[k] : -step[k];
+            moved[k] = change > SCALAR(0) ? step[k] : -step[k];
+            law[k] += moved[k];
             there = false;
         }
     }
     return there;
 }
 
-void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
-                    const struct estimator_constants *constants, const struct arm *arm,
-                    const struct estimator_sample *sample)
+OWN_FRAME void estimator_step(struct estimator *e, const struct estimator_parameters *parameters,
+                              const struct estimator_constants *constants, const struct arm *arm,
+                              const struct estimator_sample *sample)
 {
     if (e->samples <= 2u * ROW_TURNS) {
         e->samples++;
@@ -400,15 +401,22 @@ void estimator_step(struct estimator *e, const struct estimator_parameters *para
         } else {
             update_hydraulics(e, parameters, constants, i);
             e->follows_h = false;
+            if (!e->commissioning) {
+                walk(
+                    e,
+                    constants); /* of the mechanics' estimate, as many as theirs, when there is time for it */
+            }
         }
         e->since_update = 0;
     }
     e->updating = e->since_update < ROW_TURNS;
+    e->law_m_moved = !e->follows_m;
     if (!e->follows_m) {
-        e->follows_m = rate_limit(e->law_m, e->theta_m, constants->step_m, THETA_M);
+        e->follows_m = rate_limit(e->law_m, e->moved_m, e->theta_m, constants->step_m, THETA_M);
     }
     if (!e->follows_h) {
-        e->follows_h = rate_limit(e->law_h, e->theta_h, constants->step_h, THETA_H);
+        scalar moved_h[THETA_H]; /* of no use: what the oil's parameters move is not given back */
+        e->follows_h = rate_limit(e->law_h, moved_h, e->theta_h, constants->step_h, THETA_H);
     }
 }
 

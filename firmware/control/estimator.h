@@ -93,10 +93,10 @@ struct estimator_sample {
 
 #define HYDRAULIC_COLUMNS 3 /* 1/be, Om2, Om3 */
 
-/* Two equal poles. A difference quotient is never formed: its sum with the first pole is kept as `step`, in units of
- * window / pole step, and so stays as small as the steps it is made of. */
+/* Two equal poles. A difference quotient is never formed: its sum with the first pole is kept as a `step` of its own, in
+ * units of window / pole step, and so stays as small as the steps it is made of. */
 struct two_poles {
-    scalar step, first, second;
+    scalar first, second;
 };
 
 /* The samples of the last window, by turn. */
@@ -109,6 +109,7 @@ struct window {
 /* A row of the mechanics. */
 struct mechanics {
     struct two_poles column[ROW_COLUMNS + 1]; /* then the known part */
+    scalar step[ROW_COLUMNS + 1];
     struct two_poles open;   /* the gate through the same filter: how much of its window it was open */
     struct arm_row momentum; /* of the window before */
     scalar w[JOINTS];        /* its mean rates */
@@ -123,6 +124,7 @@ struct mechanics {
 /* A row of the hydraulics. */
 struct hydraulics {
     struct two_poles column[HYDRAULIC_COLUMNS + 1];
+    scalar step;                                  /* of the first, the force */
     scalar lamA_R, lamB, lamC, force, flow, gate; /* of the tick before */
     uint8_t
         strikes; /* innovations in a row that were too large: sensors contradict one another; stops at 255 */
@@ -133,6 +135,7 @@ struct estimator {
     scalar theta_h[THETA_H];
     scalar law_m[THETA_M]; /* what the law sees: rate limited */
     scalar law_h[THETA_H];
+    scalar moved_m[THETA_M];        /* by how much law_m did in the last tick, while law_m_moved */
     struct ud_factors covariance_m; /* in units of the ranges */
     struct ud_factors covariance_h;
     struct window window;
@@ -147,11 +150,13 @@ struct estimator {
     uint8_t samples;      /* since the restart, up to 2 windows and one: balances need as many */
     bool follows_m;       /* law_m is theta_m */
     bool follows_h;
+    bool law_m_moved;
     bool updating; /* an update was made within the last four ticks */
     uint8_t since_update;
 };
 
-struct estimator_constants estimator_constants(const struct estimator_parameters *parameters, scalar dt_s);
+void estimator_constants(struct estimator_constants *constants, const struct estimator_parameters *parameters,
+                         scalar dt_s);
 
 /* Everything back to the priors. */
 void estimator_start(struct estimator *estimator, const struct estimator_parameters *parameters,

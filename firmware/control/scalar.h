@@ -66,7 +66,8 @@ struct sine_cosine sine_cosine(scalar x);
  * as a ratio it needs no quotient beyond 1. */
 scalar arctangent(scalar y, scalar x);
 
-/* scalar_from_raw(raw, fraction_bits) is raw * 2^-fraction_bits, for |raw| < 2^31 and 0 <= fraction_bits <= 31. */
+/* scalar_from_raw(raw, fraction_bits) is raw * 2^-fraction_bits, for |raw| < 2^31 and 0 <= fraction_bits <= 31;
+ * scalar_from_small the same for |raw| * 2^-fraction_bits < 16 and fraction_bits <= 24, without a limit. */
 
 /* x * 2^fraction_bits to the nearest integer, halves away from zero, limited to low..high. */
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high);

@@ -11,6 +11,8 @@
 #define ARGUMENT_FRACTION 29
 #define COEFFICIENT_FRACTION 30
 #define TERMS 5
+#define ROUNDING_BITS (COEFFICIENT_FRACTION + ARGUMENT_FRACTION - 32 - SCALAR_FRACTION)
+#define ROUNDING_HALF (1 << (ROUNDING_BITS - 1))
 
 static const int32_t SINE[TERMS] = {
     COEFFICIENT(0.999999995698809019),   COEFFICIENT(-0.166666579478460114),
@@ -30,7 +32,8 @@ static scalar odd_polynomial(const int32_t *coefficient, int32_t x)
     for (uint8_t k = TERMS - 1; k > 0; k--) {
         p = (int32_t)(((int64_t)p * y) >> ARGUMENT_FRACTION) + coefficient[k - 1];
     }
-    return fixed_shifted((int64_t)p * x, COEFFICIENT_FRACTION + ARGUMENT_FRACTION - SCALAR_FRACTION);
+    /* of the product's 59 fraction bits 27 are in its high word; below 2, so there is nothing to limit */
+    return ((int32_t)(((int64_t)p * x) >> 32) + ROUNDING_HALF) >> ROUNDING_BITS;
 }
 
 /* |x| <= pi/2 */
@@ -41,6 +44,13 @@ static inline scalar sine_quarter(scalar x)
 
 #include "control/scalar_sine.inc"
 
+/* part / whole as an argument, |part| <= whole. */
+static int32_t part_of(scalar part, scalar whole)
+{
+    const int32_t ratio = (int32_t)(fixed_part(absolute(part), invert(whole)) >> (30 - ARGUMENT_FRACTION));
+    return part < 0 ? -ratio : ratio;
+}
+
 scalar arctangent(scalar y, scalar x)
 {
     const scalar a = absolute(y);
@@ -48,12 +58,12 @@ scalar arctangent(scalar y, scalar x)
     int32_t ratio;
     if (mul(a, TAN_PI_8) > x) {
         offset = HALF_PI;
-        ratio = -fixed_quotient(x, a, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = -part_of(x, a);
     } else if (a > mul(x, TAN_PI_8)) {
         offset = QUARTER_PI;
-        ratio = fixed_quotient(a - x, a + x, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = part_of(a - x, a + x);
     } else {
-        ratio = fixed_quotient(a, x, ARGUMENT_FRACTION, INT32_MAX);
+        ratio = part_of(a, x);
     }
     const scalar angle = offset + odd_polynomial(ARCTANGENT, ratio);
     return y < SCALAR(0) ? -angle : angle;
@@ -123,7 +133,7 @@ scalar quot(scalar a, scalar b)
 
 scalar fraction(uint32_t part, uint32_t whole)
 {
-    return (scalar)divide((uint64_t)part << SCALAR_FRACTION, whole);
+    return variance_part((variance)part, invert((variance)whole));
 }
 
 /* floor(sqrt(x)), 2^30 <= x. The upper 8 bits by Newton from a line, the lower from the remainder, as in long division:
@@ -173,7 +183,7 @@ inverse invert(variance v)
     /* the first 15 bits of 2^62 / normal by division, twice as many by Newton, the last ones by what is left over */
     const uint32_t guess = UINT32_MAX / (normal >> 16) << 14;
     const int64_t missing = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * guess);
-    const uint32_t better = guess + (uint32_t)(((missing >> 32) * (int64_t)guess) >> 30);
+    const uint32_t better = guess + (uint32_t)(((missing >> 32) * (int32_t)guess) >> 30);
     const int64_t left = ((int64_t)1 << 62) - (int64_t)((uint64_t)normal * better);
     const uint32_t mantissa = better + (uint32_t)(left >> 32);
     return (inverse){.mantissa = mantissa > INT32_MAX ? INT32_MAX : (int32_t)mantissa,
@@ -182,9 +192,14 @@ inverse invert(variance v)
 
 inverse scale_inverse(inverse i, scalar f)
 {
-    const uint8_t bits = f == 0 ? 0u : (uint8_t)(32u - leading_zeros(magnitude_of(f)));
-    const int32_t shift = i.shift + bits - SCALAR_FRACTION;
-    return (inverse){.mantissa = (int32_t)(((int64_t)i.mantissa * f) >> bits),
+    if (f == 0) {
+        return (inverse){.mantissa = 0, .shift = 0};
+    }
+    /* f is normalised, so that the high word of the product has its first bits */
+    const uint8_t zeros = (uint8_t)(leading_zeros(magnitude_of(f)) - 1u);
+    const int32_t normal = f * ((int32_t)1 << zeros);
+    const int32_t shift = i.shift + 32 - SCALAR_FRACTION - zeros;
+    return (inverse){.mantissa = (int32_t)(((int64_t)i.mantissa * normal) >> 32),
                      .shift = (int8_t)(shift < INVERSE_SHIFT_MOST ? shift : INVERSE_SHIFT_MOST)};
 }
 
@@ -197,15 +212,17 @@ scalar fixed_from_raw(int32_t raw, uint8_t fraction_bits)
 
 int32_t scalar_to_raw(scalar x, uint8_t fraction_bits, int32_t low, int32_t high)
 {
-    /* half away from zero: the magnitude is rounded half up */
-    const int64_t magnitude =
-        ((int64_t)absolute(x) * ((int64_t)1 << fraction_bits) + ((int64_t)1 << (SCALAR_FRACTION - 1))) >>
-        SCALAR_FRACTION;
-    const int64_t raw = x < 0 ? -magnitude : magnitude;
-    if (raw < low) {
-        return low;
+    if (fraction_bits >= SCALAR_FRACTION) {
+        const int64_t raw = (int64_t)x * ((int64_t)1 << (fraction_bits - SCALAR_FRACTION));
+        if (raw < low) {
+            return low;
+        }
+        return raw > high ? high : (int32_t)raw;
     }
-    return raw > high ? high : (int32_t)raw;
+    /* half away from zero: the magnitude is rounded half up */
+    const uint8_t shift = (uint8_t)(SCALAR_FRACTION - fraction_bits);
+    const int32_t magnitude = (int32_t)((magnitude_of(x) + ((uint32_t)1 << (shift - 1))) >> shift);
+    return limit(x < 0 ? -magnitude : magnitude, low, high);
 }
 
 /* binary32 times 2^(fraction - exponent), rounded; parameters may use the whole word. */

@@ -15,7 +15,6 @@
 #include <stdint.h>
 
 /* Before loops of a few passes: there are no registers for a row of numbers, and code takes flash. */
-#define UNROLLS_SHORT_LOOPS false
 #define UNROLL_SHORT_LOOP
 
 typedef int32_t scalar;   /* Q7.24 */
@@ -96,7 +95,7 @@ static inline int32_t fixed_scaled(int32_t v, int32_t mantissa, int32_t shift)
     const int32_t off = shift > 31 ? shift - 31 : 0;
     const int32_t factor = off > 0 ? ((mantissa >> (off - 1)) + 1) >> 1 : mantissa;
     const int32_t rest = shift - off;
-    const int64_t x = (int64_t)v * factor + ((int64_t)1 << (rest - 1));
+    const int64_t x = (int64_t)v * factor + (int64_t)((uint32_t)1 << (rest - 1)); /* rest is 31 at most */
     const int32_t high = (int32_t)(x >> 32);
     const uint32_t most = (uint32_t)1 << (rest - 3);
     if ((uint32_t)high + most >= 2u * most) {
@@ -185,6 +184,12 @@ static inline scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
                : fixed_from_raw(raw, fraction_bits);
 }
 
+/* The same where |raw| 2^-fraction_bits < 16 is known, and fraction_bits at most SCALAR_FRACTION. */
+static inline scalar scalar_from_small(int32_t raw, uint8_t fraction_bits)
+{
+    return raw * ((int32_t)1 << (SCALAR_FRACTION - fraction_bits));
+}
+
 /* part / whole of two counts, part <= whole < 2^31. */
 scalar fraction(uint32_t part, uint32_t whole);
 
@@ -226,6 +231,20 @@ static inline gain variance_ratio(variance v, inverse i)
 static inline scalar variance_share(variance v, inverse i)
 {
     return fixed_scaled(v, i.mantissa, 62 - SCALAR_FRACTION - i.shift);
+}
+
+/* v over w, of which i is the inverse itself, for 0 <= v <= w, with 30 fraction bits: with that known it takes no more
+ * than a product. */
+static inline uint32_t fixed_part(int32_t v, inverse i)
+{
+    const uint64_t product = (uint64_t)((uint32_t)v << i.shift) * (uint32_t)i.mantissa; /* 62 fraction bits */
+    return (uint32_t)(product >> 32);
+}
+
+/* The same as a scalar. */
+static inline scalar variance_part(variance v, inverse i)
+{
+    return (scalar)((fixed_part(v, i) + (1u << (29 - SCALAR_FRACTION))) >> (30 - SCALAR_FRACTION));
 }
 
 #endif

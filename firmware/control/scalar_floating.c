@@ -126,6 +126,8 @@ gain gain_from_real32(uint32_t bits, int8_t exponent)
 #define REAL32_MANTISSA_END SCALAR(16777216)
 #define REAL32_EXPONENT_LOW (-149)
 #define REAL32_EXPONENT_HIGH 104
+#define REAL32_STRIDE SCALAR(256)
+#define REAL32_STRIDE_BITS 8
 #define REAL32_INFINITY 0x7F800000u
 #define REAL32_NAN 0x7FC00000u
 
@@ -136,6 +138,16 @@ uint32_t real32_from_scalar(scalar x, int8_t exponent)
     int16_t step = exponent; /* the number is magnitude * 2^step */
     if (!(magnitude >= SCALAR(0))) {
         return REAL32_NAN;
+    }
+    /* by strides while it is far away */
+    while (magnitude >= REAL32_MANTISSA_END * REAL32_STRIDE && step <= REAL32_EXPONENT_HIGH) {
+        magnitude = magnitude * (SCALAR(1) / REAL32_STRIDE);
+        step += REAL32_STRIDE_BITS;
+    }
+    while (magnitude < REAL32_MANTISSA_END / REAL32_STRIDE &&
+           step > REAL32_EXPONENT_LOW + REAL32_STRIDE_BITS) {
+        magnitude = magnitude * REAL32_STRIDE;
+        step -= REAL32_STRIDE_BITS;
     }
     while (magnitude >= REAL32_MANTISSA_END && step <= REAL32_EXPONENT_HIGH) {
         magnitude = magnitude * SCALAR(0.5);

@@ -16,10 +16,8 @@ typedef float scalar;
 /* Before loops of a few passes: registers for a row of numbers are there, and the passes are short. But code takes
  * flash: not where the compiler is asked for small code. */
 #if defined(__OPTIMIZE_SIZE__)
-#define UNROLLS_SHORT_LOOPS false
 #define UNROLL_SHORT_LOOP
 #else
-#define UNROLLS_SHORT_LOOPS true
 #define UNROLL_SHORT_LOOP _Pragma("GCC unroll 9")
 #endif
 
@@ -107,6 +105,11 @@ static inline scalar scalar_from_raw(int32_t raw, uint8_t fraction_bits)
     return (scalar)raw / (scalar)((uint32_t)1 << fraction_bits);
 }
 
+static inline scalar scalar_from_small(int32_t raw, uint8_t fraction_bits)
+{
+    return scalar_from_raw(raw, fraction_bits);
+}
+
 static inline scalar fraction(uint32_t part, uint32_t whole)
 {
     return (scalar)part / (scalar)whole;
@@ -158,6 +161,11 @@ static inline gain variance_ratio(variance v, inverse i)
 }
 
 static inline scalar variance_share(variance v, inverse i)
+{
+    return v * i;
+}
+
+static inline scalar variance_part(variance v, inverse i)
 {
     return v * i;
 }

@@ -36,46 +36,37 @@ static inline variance update_column(variance *D, scalar Uj[], uint8_t j, const 
     }
     const variance alpha_after = add_scaled_variance(alpha, v, f);
     *alpha_inverse = invert(alpha_after);
-    *D = scale_variance(*D, variance_share(alpha, *alpha_inverse));
+    *D = scale_variance(*D, variance_part(alpha, *alpha_inverse));
     return alpha_after;
 }
 
-/* Written once, compiled for each size that is in use: where its loops are unrolled, nothing of them is left but the
- * arithmetic. */
-static inline variance update(struct ud_factors *ud, uint8_t size, const scalar phi[], variance noise,
-                              gain K[])
+variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, gain K[])
 {
     variance P_phi[UD_SIZE_MAX];
     variance alpha = noise; /* variance of the noise, then of the innovation as columns are added */
     inverse alpha_inverse = invert(alpha);
+    /* to the largest size, and out before: where loops are unrolled nothing of them is left but that */
     UNROLL_SHORT_LOOP
-    for (uint8_t j = 0; j < size; j++) {
+    for (uint8_t j = 0; j < UD_SIZE_MAX; j++) {
+        if (j == ud->size) {
+            break;
+        }
         alpha = update_column(&ud->D[j], &ud->U[column(j)], j, phi, alpha, &alpha_inverse, P_phi);
     }
-    UNROLL_SHORT_LOOP
-    for (uint8_t j = 0; j < size; j++) {
+    for (uint8_t j = 0; j < ud->size; j++) {
         K[j] = variance_ratio(P_phi[j], alpha_inverse);
     }
     return alpha;
 }
 
-variance ud_update(struct ud_factors *ud, const scalar phi[], variance noise, gain K[])
-{
-    if (UNROLLS_SHORT_LOOPS && ud->size == UD_SIZE_MAX) {
-        return update(ud, UD_SIZE_MAX, phi, noise, K);
-    }
-    if (UNROLLS_SHORT_LOOPS && ud->size == UD_SIZE_SHORT) {
-        return update(ud, UD_SIZE_SHORT, phi, noise, K);
-    }
-    return update(ud, ud->size, phi, noise, K);
-}
-
 variance ud_variance(const struct ud_factors *ud, uint8_t k)
 {
     variance sum = ud->D[k];
-    for (uint8_t j = (uint8_t)(k + 1); j < ud->size; j++) {
-        const scalar u = ud->U[column(j) + k];
-        sum = add_variance(sum, scale_variance(scale_variance(ud->D[j], u), u));
+    uint8_t at = (uint8_t)(column((uint8_t)(k + 1u)) + k);
+    for (uint8_t j = (uint8_t)(k + 1u); j < ud->size; j++) {
+        const scalar u = ud->U[at];
+        sum = add_scaled_variance(sum, scale_variance(ud->D[j], u), u);
+        at = (uint8_t)(at + j);
     }
     return sum;
 }

@@ -9,7 +9,6 @@
 #include "control/scalar.h"
 
 #define UD_SIZE_MAX 9
-#define UD_SIZE_SHORT 5 /* the other size that is in use */
 #define UD_OFF_DIAGONAL (UD_SIZE_MAX * (UD_SIZE_MAX - 1) / 2)
 
 struct ud_factors {

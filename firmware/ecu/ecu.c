@@ -86,7 +86,7 @@ enum ecu_status ecu_init(struct ecu *ecu, const struct parameter_image *image, u
         return ECU_PERIOD_RANGE;
     }
     ecu->period_us = period_us;
-    ecu->constants = controller_constants(&ecu->machine, dt_s);
+    controller_constants(&ecu->constants, &ecu->machine, dt_s);
     restart(ecu);
     return ECU_OK;
 }
@@ -147,10 +147,10 @@ static void reload(struct ecu *ecu, const struct ecu_port *port)
         ecu->image = *fallback;
     }
     (void)parameters_load(&ecu->machine, &ecu->bases, &ecu->image, &entry);
-    ecu->constants = controller_constants(&ecu->machine, ecu->constants.dt_s);
+    controller_constants(&ecu->constants, &ecu->machine, ecu->constants.dt_s);
 }
 
-void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
 {
     if (ecu->restart_requested) {
         shut_valves(ecu, port);
@@ -217,7 +217,7 @@ static void receive_frame(struct ecu *ecu, const struct ecu_port *port, const st
     }
 }
 
-bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME bool ecu_tick_receive(struct ecu *ecu, const struct ecu_port *port)
 {
     struct can_frame_11bit frame;
     const bool was_complete = receive_complete(&ecu->receive);
@@ -314,7 +314,7 @@ static void work(struct ecu *ecu, const struct ecu_port *port)
     operation_step(ecu);
 }
 
-void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
+OWN_FRAME void ecu_tick_end(struct ecu *ecu, const struct ecu_port *port)
 {
     if (!receive_complete(&ecu->receive)) {
         count_u16(&ecu->counters.late_ticks);

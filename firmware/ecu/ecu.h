@@ -62,6 +62,8 @@ struct ecu {
     struct supervision supervision;
     struct receive receive;
     struct sensor_samples samples;
+    struct sample_limits sample_limits; /* with full_pressure, from machine, bases and period */
+    scalar full_pressure;               /* 2^16 raw steps of a pressure */
     struct tare tare;
     struct safe_stop stop;
     bool sampled;           /* samples hold a complete set */

@@ -86,24 +86,32 @@ static enum object_abort find_in_range(uint16_t first, uint16_t count, enum obje
     return OBJECT_DONE;
 }
 
+/* The table is in the order of index and sub-index. */
 static enum object_abort find_row(uint16_t index, uint8_t sub, struct object *object)
 {
-    enum object_abort result = ABORT_NO_OBJECT;
-    for (uint16_t k = 0; k < OBJECT_ROWS; k++) {
-        if (TABLE[k].index != index) {
-            continue;
+    const uint32_t wanted = (uint32_t)index << 8 | sub;
+    uint16_t first = 0; /* the row is one of first..end - 1 */
+    uint16_t end = OBJECT_ROWS;
+    while (end - first > 1) {
+        const uint16_t middle = (uint16_t)((first + end) / 2u);
+        if (((uint32_t)TABLE[middle].index << 8 | TABLE[middle].sub) <= wanted) {
+            first = middle;
+        } else {
+            end = middle;
         }
-        if (TABLE[k].sub == sub) {
-            *object = (struct object){.kind = OBJECT_ROW,
-                                      .type = (enum object_type)TABLE[k].type,
-                                      .at = k,
-                                      .sub = sub,
-                                      .access = TABLE[k].access};
-            return OBJECT_DONE;
-        }
-        result = ABORT_NO_SUB_INDEX;
     }
-    return result;
+    if (TABLE[first].index != index) {
+        return ABORT_NO_OBJECT; /* every object begins with sub-index 0 */
+    }
+    if (TABLE[first].sub != sub) {
+        return ABORT_NO_SUB_INDEX;
+    }
+    *object = (struct object){.kind = OBJECT_ROW,
+                              .type = (enum object_type)TABLE[first].type,
+                              .at = first,
+                              .sub = sub,
+                              .access = TABLE[first].access};
+    return OBJECT_DONE;
 }
 
 /* Sub-index 0 of all three kinds says how many there are. */

@@ -16,7 +16,7 @@ static void start_anew(struct ecu *ecu)
     const struct bases before = ecu->bases;
     uint16_t entry = 0;
     (void)parameters_load(&ecu->machine, &ecu->bases, &ecu->image, &entry);
-    ecu->constants = controller_constants(&ecu->machine, ecu->constants.dt_s);
+    controller_constants(&ecu->constants, &ecu->machine, ecu->constants.dt_s);
     const bool held = ecu->controller.estimator.held; /* follows from the active faults, not from the set */
     controller_start(&ecu->controller, &ecu->machine, &ecu->constants);
     ecu->controller.estimator.held = held;

@@ -2,6 +2,7 @@
 
 #include "can_protocol/generated/diarc.h"
 #include "ecu/e2e.h"
+#include "ecu/little_endian.h"
 
 #define CYCLIC_ROWS (1u << RX_ENCODERS | 1u << RX_PRESSURES_SWING | 1u << RX_PRESSURES_WRIST)
 
@@ -53,9 +54,7 @@ enum receive_result receive_accept(struct receive *receive, const struct can_fra
     state->fresh = true;
     receive->came |= (uint8_t)(1u << k);
     state->counter = e2e_counter(frame->data);
-    for (uint8_t n = 0; n < 8u; n++) {
-        state->data[n] = frame->data[n];
-    }
+    copy_data(state->data, frame->data);
     return RECEIVE_GOOD;
 }
 

@@ -10,12 +10,41 @@
 
 static scalar angle_of(int32_t raw)
 {
-    return WIRE_DECODE(raw, DIARC_ENCODERS_SWING_ANGLE, 0);
+    return WIRE_DECODE_SMALL(raw, DIARC_ENCODERS_SWING_ANGLE);
 }
 
-static scalar pressure_of(const struct ecu *ecu, int32_t raw)
+/* A raw pressure has 16 bits: it is a share of what 2^16 steps are. */
+#define PRESSURE_BITS 16
+#define PRESSURE_FULL 65536
+
+static scalar pressure_of(const struct ecu *ecu, uint16_t raw)
 {
-    return WIRE_DECODE(raw, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure);
+    return mul(scalar_from_small(raw, PRESSURE_BITS), ecu->full_pressure);
+}
+
+static int32_t raw_angle(scalar q)
+{
+    return WIRE_ENCODE(q, DIARC_ENCODERS_SWING_ANGLE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
+}
+
+static int32_t raw_pressure(const struct ecu *ecu, scalar p)
+{
+    return WIRE_ENCODE(p, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure, 0, WIRE_MAX_U16);
+}
+
+void samples_start(struct ecu *ecu)
+{
+    const struct machine *const machine = &ecu->machine;
+    const struct limits *const limits = &machine->limits;
+    struct sample_limits *const raw = &ecu->sample_limits;
+    ecu->full_pressure = WIRE_DECODE(PRESSURE_FULL, DIARC_PRESSURES_SWING_BORE_PRESSURE, ecu->bases.pressure);
+    for (uint8_t i = 0; i < JOINTS; i++) {
+        raw->angle_low[i] = raw_angle(machine->cylinder[i].q_min - limits->angle_range);
+        raw->angle_high[i] = raw_angle(machine->cylinder[i].q_max + limits->angle_range);
+        raw->angle_step[i] = raw_angle(mul(limits->rate[i], ecu->constants.dt_s));
+    }
+    raw->pressure_high = raw_pressure(ecu, limits->pressure_range);
+    raw->pressure_step = raw_pressure(ecu, limits->pressure_step);
 }
 
 /* A frame that did not come, or was refused. */
@@ -33,12 +62,15 @@ static int32_t predicted_angle(const struct ecu *ecu, enum joint i)
     return WIRE_ENCODE(q, DIARC_TRACKING_SWING_REFERENCE, 0, -WIRE_MAX_S24, WIRE_MAX_S24);
 }
 
+static int32_t magnitude(int32_t x)
+{
+    return x < 0 ? -x : x;
+}
+
 static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t raw, int32_t before)
 {
-    const struct cylinder *const cylinder = &ecu->machine.cylinder[i];
-    const scalar beyond = ecu->machine.limits.angle_range;
-    const scalar q = angle_of(raw);
-    if (q < cylinder->q_min - beyond || q > cylinder->q_max + beyond) {
+    const struct sample_limits *const limits = &ecu->sample_limits;
+    if (raw < limits->angle_low[i] || raw > limits->angle_high[i]) {
         return FAULT_SENSOR_RANGE;
     }
     if (!ecu->controller.armed) {
@@ -47,27 +79,33 @@ static enum ecu_fault judge_angle(const struct ecu *ecu, enum joint i, int32_t r
     /* The sample before may be a prediction. The arm is not far from this tick's: an encoder that was missing or refused
      * has to come closer to that than one that is believed may move. */
     const bool doubted = ecu->supervision.sensors_wrong > 0u;
-    const scalar most = mul(ecu->machine.limits.rate[i], ecu->constants.dt_s);
-    const scalar off = absolute(angle_of(raw - (doubted ? predicted_angle(ecu, i) : before)));
-    return off > (doubted ? mul(SCALAR(0.25), most) : most) ? FAULT_SENSOR_RATE : FAULT_NONE;
+    const int32_t off = doubted ? 4 * magnitude(raw - predicted_angle(ecu, i)) : magnitude(raw - before);
+    return off > limits->angle_step[i] ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
-static enum ecu_fault judge_pressure(const struct ecu *ecu, int32_t raw, int32_t before)
+/* A pressure changes by less than this in the ticks since the last that was good; the same for all of them. */
+static int32_t pressure_step_end(const struct ecu *ecu)
 {
-    const struct limits *const limits = &ecu->machine.limits;
-    if (pressure_of(ecu, raw) > limits->pressure_range) {
-        return FAULT_SENSOR_RANGE;
+    if (!ecu->controller.armed) {
+        return WIRE_MAX_U16 + 1; /* by anything */
     }
     /* what was kept over missing frames may have changed meanwhile; a value that was refused may not */
     const enum ecu_fault cause = ecu->supervision.wrong_cause;
     const bool kept = cause == FAULT_SENSOR_FRAMES_LOST || cause == FAULT_SENSOR_FRAMES_CORRUPT;
     const uint32_t ticks = kept ? 1u + ecu->supervision.sensors_wrong : 1u;
     const int32_t steps = (int32_t)((ticks * ecu->period_us + US_PER_STEP - 1u) / US_PER_STEP);
-    const scalar step = absolute(pressure_of(ecu, (raw - before) / steps));
     /* as of an angle, a sensor that was refused has to come closer */
     const bool doubted = !kept && ecu->supervision.sensors_wrong > 0u;
-    const scalar most = doubted ? mul(SCALAR(0.25), limits->pressure_step) : limits->pressure_step;
-    return ecu->controller.armed && step > most ? FAULT_SENSOR_RATE : FAULT_NONE;
+    const int32_t most = ecu->sample_limits.pressure_step;
+    return ((doubted ? most / 4 : most) + 1) * steps;
+}
+
+static enum ecu_fault judge_pressure(const struct ecu *ecu, uint16_t raw, uint16_t before, int32_t step_end)
+{
+    if (raw > ecu->sample_limits.pressure_high) {
+        return FAULT_SENSOR_RANGE;
+    }
+    return magnitude((int32_t)raw - before) >= step_end ? FAULT_SENSOR_RATE : FAULT_NONE;
 }
 
 static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *samples)
@@ -75,9 +113,9 @@ static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *
     if (!ecu->receive.row[RX_ENCODERS].fresh) {
         return missing(ecu, RX_ENCODERS);
     }
-    struct diarc_encoders_t raw = {0};
-    (void)diarc_encoders_unpack(&raw, ecu->receive.row[RX_ENCODERS].data, DIARC_ENCODERS_LENGTH);
-    if (raw.sensor_status == SENSOR_STATUS_INVALID || raw.swing_angle == WIRE_INVALID_S24 ||
+    struct diarc_encoders_t raw;
+    const int done = diarc_encoders_unpack(&raw, ecu->receive.row[RX_ENCODERS].data, DIARC_ENCODERS_LENGTH);
+    if (done != 0 || raw.sensor_status == SENSOR_STATUS_INVALID || raw.swing_angle == WIRE_INVALID_S24 ||
         raw.wrist_angle == WIRE_INVALID_S24) {
         return FAULT_SENSOR_INVALID;
     }
@@ -92,22 +130,24 @@ static enum ecu_fault take_angles(const struct ecu *ecu, struct sensor_samples *
     return wrong;
 }
 
-static enum ecu_fault take_pressures(const struct ecu *ecu, enum joint i, struct sensor_samples *samples)
+static enum ecu_fault take_pressures(const struct ecu *ecu, enum joint i, struct sensor_samples *samples,
+                                     int32_t step_end)
 {
     const enum received_frame row = i == SWING ? RX_PRESSURES_SWING : RX_PRESSURES_WRIST;
     if (!ecu->receive.row[row].fresh) {
         return missing(ecu, row);
     }
     /* Both frames have the same layout; the DBC has two only because identifiers differ. */
-    struct diarc_pressures_swing_t raw = {0};
-    (void)diarc_pressures_swing_unpack(&raw, ecu->receive.row[row].data, DIARC_PRESSURES_SWING_LENGTH);
-    if (raw.sensor_status == SENSOR_STATUS_INVALID || raw.bore_pressure == WIRE_INVALID_U16 ||
+    struct diarc_pressures_swing_t raw;
+    const int done =
+        diarc_pressures_swing_unpack(&raw, ecu->receive.row[row].data, DIARC_PRESSURES_SWING_LENGTH);
+    if (done != 0 || raw.sensor_status == SENSOR_STATUS_INVALID || raw.bore_pressure == WIRE_INVALID_U16 ||
         raw.annulus_pressure == WIRE_INVALID_U16 || raw.spool_position == WIRE_INVALID_S16) {
         return FAULT_SENSOR_INVALID;
     }
-    enum ecu_fault wrong = judge_pressure(ecu, raw.bore_pressure, samples->pressure[i][BORE]);
+    enum ecu_fault wrong = judge_pressure(ecu, raw.bore_pressure, samples->pressure[i][BORE], step_end);
     if (wrong == FAULT_NONE) {
-        wrong = judge_pressure(ecu, raw.annulus_pressure, samples->pressure[i][ANNULUS]);
+        wrong = judge_pressure(ecu, raw.annulus_pressure, samples->pressure[i][ANNULUS], step_end);
     }
     if (wrong == FAULT_NONE) {
         samples->pressure[i][BORE] = raw.bore_pressure;
@@ -134,8 +174,9 @@ enum ecu_fault samples_take(struct ecu *ecu)
         samples->angle[SWING] = predicted_angle(ecu, SWING);
         samples->angle[WRIST] = predicted_angle(ecu, WRIST);
     }
-    wrong = worse(wrong, take_pressures(ecu, SWING, samples));
-    return worse(wrong, take_pressures(ecu, WRIST, samples));
+    const int32_t step_end = pressure_step_end(ecu);
+    wrong = worse(wrong, take_pressures(ecu, SWING, samples, step_end));
+    return worse(wrong, take_pressures(ecu, WRIST, samples, step_end));
 }
 
 struct measurement samples_measured(const struct ecu *ecu, const struct sensor_samples *before)
@@ -148,7 +189,7 @@ struct measurement samples_measured(const struct ecu *ecu, const struct sensor_s
         m.dq[i] = angle_of(now->angle[i] - before->angle[i]);
         m.p[i][BORE] = pressure_of(ecu, now->pressure[i][BORE]) - ecu->tare.offset[i][BORE];
         m.p[i][ANNULUS] = pressure_of(ecu, now->pressure[i][ANNULUS]) - ecu->tare.offset[i][ANNULUS];
-        m.spool[i] = WIRE_DECODE(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
+        m.spool[i] = WIRE_DECODE_SMALL(now->spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION);
     }
     return m;
 }

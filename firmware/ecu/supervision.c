@@ -56,6 +56,7 @@ static uint8_t count_of(scalar number)
 
 void supervision_start(struct ecu *ecu)
 {
+    samples_start(ecu);
     const struct limits *const limits = &ecu->machine.limits;
     const uint32_t period_us = ecu->period_us;
     ecu->supervision = (struct supervision){
@@ -112,7 +113,7 @@ static bool lasts(struct supervision *s, enum lasting which, bool condition, uin
 static void watch_spools(struct ecu *ecu, const struct ecu_port *port)
 {
     for (uint8_t i = 0; i < JOINTS; i++) {
-        const scalar spool = WIRE_DECODE(ecu->samples.spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION, 0);
+        const scalar spool = WIRE_DECODE_SMALL(ecu->samples.spool[i], DIARC_PRESSURES_SWING_SPOOL_POSITION);
         const bool far = absolute(ecu->controller.output[i].u - spool) > ecu->machine.limits.spool_error;
         if (lasts(&ecu->supervision, i == SWING ? LASTING_SPOOL_SWING : LASTING_SPOOL_WRIST, far,
                   ecu->supervision.spool_ticks)) {

@@ -3,6 +3,7 @@
 #include "can_protocol/generated/diarc.h"
 #include "can_protocol/generated/diarc_hash.h"
 #include "ecu/e2e.h"
+#include "ecu/little_endian.h"
 #include "ecu/wire.h"
 
 #define VALVE_DISABLED DIARC_VALVES_SWING_CONTROL_DISABLED_CHOICE
@@ -17,10 +18,8 @@ static void protect(struct ecu *ecu, enum sent_frame which, struct can_frame_11b
 {
     uint8_t *const counter = &ecu->tx_counter[which];
     e2e_protect((uint16_t)frame->id, *counter, frame->data);
-    *counter = (uint8_t)((*counter + 1u) % E2E_COUNTER_STATES);
-    for (uint8_t k = 0; k < 8u; k++) {
-        ecu->sent[which][k] = frame->data[k];
-    }
+    *counter = *counter < E2E_COUNTER_STATES - 1u ? (uint8_t)(*counter + 1u) : 0u;
+    copy_data(ecu->sent[which], frame->data);
 }
 
 struct can_frame_11bit transmit_sync(uint8_t sync_counter)

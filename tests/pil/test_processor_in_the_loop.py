@@ -26,7 +26,7 @@ WHOLE_RUN, FIRST_MOVES = (2.5, 10.0), ((0.0, 2.0), (2.5, 3.0), (10.0, 2.0))
 RUNS = [(IMAGES[0], *WHOLE_RUN), *((image, *run) for run in FIRST_MOVES for image in IMAGES)]
 RUNS.remove((IMAGES[0], *FIRST_MOVES[1]))
 COUNTED_S = 1.0
-TICK_INSTRUCTIONS_MOST = {"cortex-m4f": 7_500, "cortex-m3": 16_500}
+TICK_INSTRUCTIONS_MOST = {"cortex-m4f": 5_400, "cortex-m3": 11_500}
 STACK_BYTES_MOST = 2048  # of 4096
 BOOT_UP, SYNC = r"t701100\r", r"t0801[0-9A-F]{2}\r"
 

@@ -61,8 +61,6 @@ void setUp(void)
                      .lamA = per_unit(6e-3, WEIGHT)},
         .force = per_unit(700, FORCE),
         .leakage = per_unit(2e-6, FLOW),
-        .gain_extending = per_unit(1.2e-3, FLOW),
-        .gain_retracting = per_unit(0.9e-3, FLOW),
     };
 }
 
@@ -75,16 +73,25 @@ static void start(void)
     diarc_start(&diarc, &gains, &in);
 }
 
+/* One tick; the valve passes more oil one way. */
+static struct diarc_output tick(struct diarc *d, const struct diarc_input *input)
+{
+    const struct diarc_constants constants = diarc_constants(&gains);
+    const struct diarc_steps steps = diarc_flow(d, &gains, &constants, input, PER_TICK);
+    const scalar QL_gain = per_unit(steps.Q_Ld >= SCALAR(0) ? 1.2e-3 : 0.9e-3, FLOW);
+    return diarc_opening(d, &gains, input, &steps, QL_gain, from_real(DT_S));
+}
+
 /* One tick from the same state, without moving on. */
 static struct diarc_output try_out(const struct diarc_input *input)
 {
     struct diarc copy = diarc;
-    return diarc_step(&copy, &gains, input, from_real(DT_S), PER_TICK);
+    return tick(&copy, input);
 }
 
 static struct diarc_output step(void)
 {
-    return diarc_step(&diarc, &gains, &in, from_real(DT_S), PER_TICK);
+    return tick(&diarc, &in);
 }
 
 /* Spool set-point with the pure feedback of the gains that are left on. */

@@ -34,7 +34,7 @@ static int torque_base;
 
 static void restart_estimator(void)
 {
-    constants = estimator_constants(parameters, from_real(DT_S));
+    estimator_constants(&constants, parameters, from_real(DT_S));
     estimator_start(&estimator, parameters, &constants);
 }
 
@@ -248,7 +248,8 @@ static void test_rates_wrong_at_the_shortest_or_the_longest_period(void)
     static const double periods_s[] = {250e-6, 400e-6, 500e-6, 1e-3, 20e-3};
     for (unsigned n = 0; n < COUNT_OF(periods_s); n++) {
         const scalar dt_s = from_real(periods_s[n]);
-        const struct estimator_constants c = estimator_constants(parameters, dt_s);
+        struct estimator_constants c;
+        estimator_constants(&c, parameters, dt_s);
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK, 1, real_gain(c.per_tick) * real(dt_s));
         TEST_ASSERT_DOUBLE_WITHIN(PER_TICK * real(c.filter), real(c.filter),
                                   real_gain(c.filter_rate) * ROW_TURNS * real(dt_s));

@@ -403,6 +403,9 @@ static void test_ratio_or_share_of_variances_beyond_its_bound(void)
         if (fabs(exact) <= 1) {
             TEST_ASSERT_DOUBLE_WITHIN(SHARE_BOUND * STEP, exact, real(variance_share(part, i)));
             TEST_ASSERT_TRUE(absolute(variance_share(part, i)) <= SCALAR(1));
+            const scalar of_magnitude = variance_part(absolute(part), i);
+            TEST_ASSERT_DOUBLE_WITHIN(SHARE_BOUND * STEP, fabs(exact), real(of_magnitude));
+            TEST_ASSERT_TRUE(of_magnitude <= SCALAR(1));
         }
     }
     TEST_ASSERT_EQUAL_INT32(SCALAR(1), variance_share(VARIANCE(0.3), invert(VARIANCE(0.3))));
@@ -531,7 +534,8 @@ static void test_covariance_of_a_moving_arm_lost(void)
     struct machine machine;
     struct bases bases;
     load_reference_arm(&machine, &bases);
-    const struct estimator_constants constants = estimator_constants(&machine.estimator, SCALAR(1e-3));
+    struct estimator_constants constants;
+    estimator_constants(&constants, &machine.estimator, SCALAR(1e-3));
     static struct estimator estimator;
     estimator_start(&estimator, &machine.estimator, &constants);
     struct ud_factors *const ud = &estimator.covariance_m;

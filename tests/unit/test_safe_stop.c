@@ -18,7 +18,7 @@ static struct measurement at;
 void setUp(void)
 {
     load_reference_arm(&machine, &bases);
-    constants = controller_constants(&machine, SCALAR(0.001));
+    controller_constants(&constants, &machine, SCALAR(0.001));
     controller_start(&controller, &machine, &constants);
     at = (struct measurement){.q = {SCALAR(0.1), SCALAR(0.1)}};
     static const double bar[JOINTS][CHAMBERS] = {{50, 73.14}, {42.06, 50}};

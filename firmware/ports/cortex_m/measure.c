@@ -66,32 +66,29 @@ void measure_end_tick(void)
     ticks++;
 }
 
-/* The linker makes calls of NAME calls of __wrap_NAME, and __real_NAME is NAME. */
-void __real_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
-                           const struct estimator_constants *constants, const struct arm *arm,
-                           const struct estimator_sample *sample);
-void __real_controller_step(struct controller *controller, const struct machine *machine,
-                            const struct controller_constants *constants, const struct measurement *measured);
-void __wrap_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
-                           const struct estimator_constants *constants, const struct arm *arm,
-                           const struct estimator_sample *sample);
-void __wrap_controller_step(struct controller *controller, const struct machine *machine,
-                            const struct controller_constants *constants, const struct measurement *measured);
+/* controller.c and ecu.c call these instead in an image that counts (CMakeLists.txt). */
+void measured_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                             const struct estimator_constants *constants, const struct arm *arm,
+                             const struct estimator_sample *sample);
+void measured_controller_step(struct controller *controller, const struct machine *machine,
+                              const struct controller_constants *constants,
+                              const struct measurement *measured);
 
-void __wrap_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
-                           const struct estimator_constants *constants, const struct arm *arm,
-                           const struct estimator_sample *sample)
+void measured_estimator_step(struct estimator *estimator, const struct estimator_parameters *parameters,
+                             const struct estimator_constants *constants, const struct arm *arm,
+                             const struct estimator_sample *sample)
 {
     const enum stage before = measure_switch(STAGE_ESTIMATE);
-    __real_estimator_step(estimator, parameters, constants, arm, sample);
+    estimator_step(estimator, parameters, constants, arm, sample);
     (void)measure_switch(before);
 }
 
-void __wrap_controller_step(struct controller *controller, const struct machine *machine,
-                            const struct controller_constants *constants, const struct measurement *measured)
+void measured_controller_step(struct controller *controller, const struct machine *machine,
+                              const struct controller_constants *constants,
+                              const struct measurement *measured)
 {
     const enum stage before = measure_switch(STAGE_CONTROL);
-    __real_controller_step(controller, machine, constants, measured);
+    controller_step(controller, machine, constants, measured);
     (void)measure_switch(before);
 }
 

@@ -1,8 +1,9 @@
 /* With DIARC_COUNT_INSTRUCTIONS: how many processor cycles each stage of a tick takes, and the stack's
  * depth. Where an instruction takes a fixed time, as in QEMU with -icount, the cycles count instructions.
- * Else nothing of this is in the image. Estimate and control are parts of ecu_tick_end: their functions are wrapped by the
- * linker (--wrap), so that the code that is measured is the code that runs. The SLCAN command M answers for all ticks
- * since the start, of every mode, in hexadecimal:
+ * Else nothing of this is in the image. Estimate and control are parts of ecu_tick_end: measure.c has a function that
+ * measures in front of each of theirs, which are functions of their own in every image (OWN_FRAME), so that the code that
+ * is measured is the code that runs. The SLCAN command M answers for all ticks since the start, of every mode, in
+ * hexadecimal:
  *
  *     M STAGE least mean most     a line for each stage: two digits and three times eight, without spaces
  *     MFF ticks stack 0            the ticks counted, the bytes of stack used */

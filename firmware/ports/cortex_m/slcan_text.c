@@ -1,5 +1,7 @@
 #include "ports/cortex_m/slcan_text.h"
 
+#include "ecu/little_endian.h"
+
 #define ID_DIGITS 3u
 #define HEAD 5u /* t, identifier, length */
 
@@ -10,9 +12,7 @@ void slcan_write_frame(const struct can_frame_11bit *frame, struct uart_line *li
     line->digits = (uint8_t)(ID_DIGITS + 1u + 2u * frame->length);
     line->packed[0] = (uint8_t)(frame->id >> 4);
     line->packed[1] = (uint8_t)(frame->id << 4 | frame->length);
-    for (uint8_t k = 0; k < sizeof frame->data; k++) {
-        line->packed[2u + k] = frame->data[k];
-    }
+    copy_data(&line->packed[2], frame->data);
 }
 
 /* False when one of the characters is no digit. */
