@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import protocol, results, session
+from sil_plant.bus import protocol
+from sil_plant.loop import results, session
 
 KEYS = (
     "load_true_kg load_est_kg load_err_kg load_settle_s peak_err_rad peak_err_after_1s_rad rms_err_rad rho_s "

@@ -22,10 +22,10 @@ from pathlib import Path
 import can
 import pytest
 
-from sil_plant import protocol
-from sil_plant.buses import connect_python_can
-from sil_plant.machine import REFERENCE_ARM
-from sil_plant.scenario import DEFAULT_SCENARIO
+from sil_plant.bus import protocol
+from sil_plant.bus.ports import connect_python_can
+from sil_plant.inputs.machine import REFERENCE_ARM
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 30.0  # no wait in this file is longer; reaching it is a failure

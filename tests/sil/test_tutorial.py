@@ -26,7 +26,7 @@ from pathlib import Path
 
 import pytest
 
-from sil_plant.hub import Hub
+from sil_plant.bus.hub import Hub
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
