@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
@@ -32,6 +31,7 @@ if __name__ == "__main__":
     enter(__file__)
 
 from sil_plant.config import ConfigError  # noqa: E402
+from tools.signals import take_for_interrupt  # noqa: E402
 
 NEEDED = ("SALib", "pebble", "pyarrow", "scipy")
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
@@ -71,16 +71,16 @@ def main(argv: list[str]) -> int:
     if missing:
         say(f"campaign.py: the package {missing[0]} is missing here; bring the environment in step: make setup")
         return EXIT_WRONG_USE
-    signal.signal(signal.SIGTERM, _interrupt)
+    take_for_interrupt(signal.SIGTERM)
     # imported here, for the workers that are spawned read this file, too
-    from sil_plant.campaigning.pool import ClusterLostError
+    from sil_plant.campaigning.pool import WorkersLostError
 
     try:
         return _main(arguments)
     except ConfigError as error:
         say(f"campaign.py: {error}")
         return EXIT_WRONG_USE
-    except ClusterLostError as error:
+    except WorkersLostError as error:
         say(f"campaign.py: {error}; finished batches are kept, continue with --resume")
         return EXIT_FAILED
     except KeyboardInterrupt:
@@ -280,11 +280,6 @@ def _with_progress(results: Iterator, planned: int, done: int, quiet: bool) -> I
 
 def _tell(text: str) -> None:
     say(f"campaign.py: {text}")
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C: finished batches are written already."""
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

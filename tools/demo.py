@@ -39,6 +39,7 @@ from sil_plant.bus import protocol  # noqa: E402
 from sil_plant.bus.hub import DEFAULT_PORT  # noqa: E402
 from sil_plant.bus.ports import BusAddress, BusError, open_frame_port, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
+from sil_plant.monitoring.host import kernel_has_can  # noqa: E402
 from sil_plant.reports import figures  # noqa: E402
 
 OUT = ROOT / "out"
@@ -164,15 +165,6 @@ def check_bus(address: BusAddress) -> None:
             )
     if led_by_another:
         raise BusError(f"another ECU is on {address}; stop it, or use another bus: --bus vcan1")
-
-
-def kernel_has_can() -> bool:
-    """Whether this kernel knows CAN sockets."""
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (OSError, AttributeError):
-        return False
-    return True
 
 
 def raise_interface(name: str) -> None:

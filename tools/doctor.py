@@ -21,7 +21,6 @@ import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
-from types import FrameType
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
@@ -38,6 +37,7 @@ from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.monitoring.diagnosis import Evidence, Finding, diagnose, examine  # noqa: E402
 from sil_plant.monitoring.listen import joinable  # noqa: E402
 from sil_plant.monitoring.view import Place, one_line  # noqa: E402
+from tools.signals import take_for_interrupt  # noqa: E402
 
 EXIT_FINDINGS, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 LISTEN_S = 2.0
@@ -79,7 +79,7 @@ def report(findings: list[Finding], evidence: Evidence) -> None:
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
-    signal.signal(signal.SIGTERM, _interrupt)
+    take_for_interrupt(signal.SIGTERM)
     try:
         address = joinable(arguments.bus)
         if not arguments.json:
@@ -99,11 +99,6 @@ def main(argv: list[str]) -> int:
     else:
         report(findings, evidence)
     return EXIT_FINDINGS if any(finding.severity != "note" for finding in findings) else 0
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C."""
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

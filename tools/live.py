@@ -27,7 +27,6 @@ import webbrowser
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,6 +48,7 @@ from sil_plant.monitoring.listen import Listener, joinable  # noqa: E402
 from sil_plant.monitoring.master import Master  # noqa: E402
 from sil_plant.monitoring.view import Place  # noqa: E402
 from sil_plant.monitoring.watch import Snapshot, Watch  # noqa: E402
+from tools.signals import take_for_interrupt  # noqa: E402
 
 if TYPE_CHECKING:
     from sil_plant.live.page import Page, Wish
@@ -252,8 +252,7 @@ def main(argv: list[str]) -> int:
     if missing:
         say(f"live.py: PyPI {missing[0]} is missing here: make setup, or pip install '.[live]'")
         return EXIT_WRONG_USE
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
+    take_for_interrupt(signal.SIGTERM, signal.SIGHUP)
     picture: Picture | None = None
     try:
         with contextlib.ExitStack() as stack:
@@ -283,11 +282,6 @@ def main(argv: list[str]) -> int:
             return EXIT_FAILED
         show(f"written: {arguments.screenshot}")
     return 0
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C."""
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

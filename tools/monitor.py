@@ -21,7 +21,6 @@ import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
@@ -38,6 +37,7 @@ from sil_plant.config import ConfigError  # noqa: E402
 from sil_plant.monitoring.listen import Listener, joinable  # noqa: E402
 from sil_plant.monitoring.view import TRACE_POINTS, Place, one_line, page  # noqa: E402
 from sil_plant.monitoring.watch import Snapshot, Watch  # noqa: E402
+from tools.signals import take_for_interrupt  # noqa: E402
 
 EXIT_NOTHING_HEARD, EXIT_WRONG_USE = 1, 2
 REFRESH_S = 0.25
@@ -123,7 +123,7 @@ def follow_in_lines(monitor: Monitor, as_json: bool) -> None:
 def main(argv: list[str]) -> int:
     """Run the command line; the exit status."""
     arguments = parse_arguments(argv)
-    signal.signal(signal.SIGTERM, _interrupt)
+    take_for_interrupt(signal.SIGTERM)
     console = Console()
     try:
         address = joinable(arguments.bus)
@@ -146,11 +146,6 @@ def main(argv: list[str]) -> int:
     except KeyboardInterrupt:
         pass
     return 0
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Treat SIGTERM as Ctrl-C."""
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

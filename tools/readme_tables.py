@@ -1,5 +1,7 @@
 """Rewrite the parts of README.md that follow from the DBC and from runs; they stand between markers.
 
+The last `make bench` and `make campaign` are read, not run.
+
 Examples
 --------
   python tools/readme_tables.py            write (about 10 s; needs make firmware)
@@ -115,27 +117,51 @@ def speed_table() -> str:
     return readme_table(result)
 
 
+def campaign_table() -> str:
+    """How a thousand arms do, from the last `make campaign`."""
+    arguments = [sys.executable, "tools/campaign.py", "sil_plant/campaigns/production.toml", "--table"]
+    done = subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise ConfigError(done.stderr.strip())
+    return done.stdout.rstrip()
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "frames": frames_table,
     "example": example_run,
     "comparison": comparison_table,
 }
+# From results that take minutes or an idle computer: made anew when they are there, else left as they are.
+MEASURED: dict[str, Callable[[], str]] = {"speed": speed_table, "campaign": campaign_table}
 
 
-def rewrite(text: str) -> str:
+def rewrite(text: str, measured: bool = False) -> str:
     """The README with every part made anew.
+
+    Parameters
+    ----------
+    text : str
+        As it is.
+    measured : bool
+        Those of `MEASURED`, too, as far as there are results.
 
     Raises
     ------
     ConfigError
         When a marker is missing.
     """
-    for name, make in PARTS.items():
+    made = {name: make() for name, make in PARTS.items()}
+    for name, make in MEASURED.items() if measured else ():
+        try:
+            made[name] = make()
+        except ConfigError as error:
+            say(f"readme_tables: the part {name} stays as it is: {error}")
+    for name, part in made.items():
         start, end = f"<!-- {name}: made by tools/readme_tables.py -->", f"<!-- end of {name} -->"
         if text.count(start) != 1 or text.count(end) != 1 or text.index(end) < text.index(start):
             raise ConfigError(f"{README.name}: the markers `{start}` and `{end}` are needed once, in this order")
         before, rest = text.split(start)
-        text = f"{before}{start}\n{make()}\n{end}{rest.split(end)[1]}"
+        text = f"{before}{start}\n{part}\n{end}{rest.split(end)[1]}"
     return text
 
 
@@ -146,7 +172,7 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         old = README.read_text(encoding="utf-8")
-        new = rewrite(old)
+        new = rewrite(old, measured=not arguments.check)
         if new == old:
             return 0
         if arguments.check:

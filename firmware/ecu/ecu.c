@@ -43,6 +43,7 @@ static void restart(struct ecu *ecu)
     ecu->stop = (struct safe_stop){0};
     ecu->sampled = false;
     ecu->restart_requested = false;
+    ecu->reload_requested = false;
     ecu->boot_up_due = true;
     ecu->is_pending = false;
     ecu->pending = EVENT_STANDBY;
@@ -129,10 +130,33 @@ static void shut_valves(struct ecu *ecu, const struct ecu_port *port)
     }
 }
 
+/* The parameters of power-on: those stored, else those to fall back on. Without a store those in force stay. */
+static void reload(struct ecu *ecu, const struct ecu_port *port)
+{
+    uint16_t entry = 0;
+    if (port->store == NULL) {
+        return;
+    }
+    ecu->stored = store_load(port->store, &ecu->image);
+    const bool found = ecu->stored == STORE_OK || ecu->stored == STORE_OLDER;
+    if (!found || parameters_check(&ecu->image, &entry) != ECU_OK ||
+        !parameters_suit_period(&ecu->image, ecu->constants.dt_s)) {
+        ecu->stored = found ? STORE_FOREIGN : ecu->stored;
+        const struct parameter_image *const fallback =
+            port->fallback != NULL ? port->fallback : &default_parameter_image;
+        ecu->image = *fallback;
+    }
+    (void)parameters_load(&ecu->machine, &ecu->bases, &ecu->image, &entry);
+    ecu->constants = controller_constants(&ecu->machine, ecu->constants.dt_s);
+}
+
 void ecu_tick_begin(struct ecu *ecu, const struct ecu_port *port)
 {
     if (ecu->restart_requested) {
         shut_valves(ecu, port);
+        if (ecu->reload_requested) {
+            reload(ecu, port);
+        }
         restart(ecu);
     }
     if (ecu->boot_up_due) {
@@ -164,6 +188,8 @@ static void nmt_command(struct ecu *ecu, const struct ecu_port *port, const stru
     case DIARC_NMT_COMMAND_RESET_NODE_CHOICE:
     case DIARC_NMT_COMMAND_RESET_COMMUNICATION_CHOICE:
         ecu->restart_requested = true;
+        ecu->reload_requested =
+            ecu->reload_requested || frame->data[0] == DIARC_NMT_COMMAND_RESET_NODE_CHOICE;
         break;
     default:
         break;

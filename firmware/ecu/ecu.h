@@ -66,6 +66,7 @@ struct ecu {
     struct safe_stop stop;
     bool sampled;           /* samples hold a complete set */
     bool restart_requested; /* by NMT */
+    bool reload_requested;  /* with the parameters of power-on */
     bool boot_up_due;
     bool valves_active; /* the last valve frame opened them */
     bool is_pending;    /* `pending` waits for this tick's samples */

@@ -21,7 +21,8 @@ enum port_status {
     PORT_DOWN   /* the bus is gone; the port's owner decides what follows */
 };
 
-struct store_port; /* ecu/store.h */
+struct store_port;      /* ecu/store.h */
+struct parameter_image; /* ecu/parameters.h */
 
 struct ecu_port {
     void *context; /* handed to every function below */
@@ -32,6 +33,8 @@ struct ecu_port {
     uint32_t (*now_us)(void *context);
     /* Where parameters survive power-off; NULL: they do not, and saving is refused. */
     const struct store_port *store;
+    /* What it starts with when nothing is stored; NULL: what is built in. */
+    const struct parameter_image *fallback;
 };
 
 #endif

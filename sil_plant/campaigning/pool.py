@@ -14,6 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, Any
 
 from pebble import ProcessExpired, ProcessPool
@@ -29,14 +30,15 @@ if TYPE_CHECKING:
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
 QUEUED_PER_WORKER = 4  # batches, so that none is ever idle, and the queue stays short however long the campaign
+IDLE_DEATHS_MOST = 5  # in a row, with nothing finished in between: then they die at their start
 DEATHS_MOST = 2  # a batch whose workers die so often is given up
 CONNECT_S = 10.0
 LOOK_S = 0.1  # how often the cluster is looked at while nothing is finished
 NO_WORKERS_S = 30.0  # a scheduler that has no workers for so long has gone wrong
 
 
-class ClusterLostError(Exception):
-    """The scheduler, or all of its workers, went away; says what is kept."""
+class WorkersLostError(Exception):
+    """The scheduler, or all workers, went away; says what is kept."""
 
 
 def in_processes(
@@ -44,7 +46,8 @@ def in_processes(
 ) -> Iterator[tuple[Any, Any]]:
     """Call ``work`` with each job's arguments in some processes; yields the jobs and what they gave, as they finish.
 
-    A job whose worker dies is given to another; one that does so twice yields None.
+    A job whose worker dies is given to another; one that does so twice yields None. A worker that dies while none is
+    known to have a job takes the pool with it; then all are replaced.
 
     Parameters
     ----------
@@ -58,42 +61,81 @@ def in_processes(
         Told of every worker that died.
     name : callable
         Makes a text of what a job is called.
+
+    Raises
+    ------
+    WorkersLostError
+        When workers die and none comes to anything.
     """
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPool(min(workers, max(len(jobs), 1)), context=context, initializer=_leave_ctrl_c_to_the_parent)
+    left = dict.fromkeys(range(len(jobs)))  # an ordered set
     deaths = [0] * len(jobs)
-    waiting = iter(range(len(jobs)))
+    idle_deaths = 0
+    while left:
+        pool = ProcessPool(
+            min(workers, len(left)),
+            context=multiprocessing.get_context("spawn"),
+            initializer=_leave_ctrl_c_to_the_parent,
+        )
+        try:
+            for n, result in _in_one_pool(pool, work, jobs, list(left), workers, deaths, say, name):
+                del left[n]
+                idle_deaths = 0
+                yield jobs[n][0], result
+            pool.close()
+        except BrokenProcessPool as broken:
+            idle_deaths += 1
+            if idle_deaths > IDLE_DEATHS_MOST:
+                raise WorkersLostError("the workers die before they begin; is there memory left?") from broken
+            say("a worker has died between two batches; all are replaced")
+        finally:
+            if pool.active:
+                pool.stop()
+            pool.join()
+
+
+def _in_one_pool(
+    pool: ProcessPool,
+    work: Callable[..., Any],
+    jobs: Sequence[tuple[Any, tuple[Any, ...]]],
+    todo: Sequence[int],
+    workers: int,
+    deaths: list[int],
+    say: Say,
+    name: Callable,
+) -> Iterator[tuple[int, Any]]:
+    """The numbers of the jobs in ``todo`` and what they gave; BrokenProcessPool when nothing more can come of it."""
+    waiting = iter(todo)
     running: dict[Future, int] = {}
-    try:
-        while True:
-            for n in itertools.islice(waiting, max(QUEUED_PER_WORKER * workers - len(running), 0)):
-                running[pool.schedule(work, jobs[n][1])] = n
-            if not running:
-                break
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in finished:
-                n = running.pop(future)
-                job, args = jobs[n]
-                try:
-                    result = future.result()
-                except ProcessExpired as death:
-                    deaths[n] += 1
-                    again = deaths[n] < DEATHS_MOST
-                    say(
-                        f"the worker {death.pid} has died ({_cause(death.exitcode)}) with {name(job)}; it is replaced, "
-                        f"{'they are computed again' if again else f'they have killed {DEATHS_MOST} and are left out'}"
-                    )
-                    if again:
-                        running[pool.schedule(work, args)] = n
-                        continue
-                    result = None
-                yield job, result
-        pool.close()
-        pool.join()
-    finally:
-        if pool.active:
-            pool.stop()
-        pool.join()
+
+    def schedule(n: int) -> None:
+        try:
+            running[pool.schedule(work, jobs[n][1])] = n
+        except RuntimeError as error:
+            raise BrokenProcessPool(str(error)) from error
+
+    while True:
+        for n in itertools.islice(waiting, max(QUEUED_PER_WORKER * workers - len(running), 0)):
+            schedule(n)
+        if not running:
+            return
+        finished, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in finished:
+            n = running.pop(future)
+            try:
+                result = future.result()
+            except ProcessExpired as death:
+                deaths[n] += 1
+                again = deaths[n] < DEATHS_MOST
+                say(
+                    f"the worker {death.pid} has died ({_cause(death.exitcode)}) with {name(jobs[n][0])}; it is "
+                    "replaced, "
+                    f"{'they are computed again' if again else f'they have killed {DEATHS_MOST} and are left out'}"
+                )
+                if again:
+                    schedule(n)
+                    continue
+                result = None
+            yield n, result
 
 
 def _leave_ctrl_c_to_the_parent() -> None:
@@ -134,7 +176,7 @@ def on_cluster(
     ------
     ConfigError
         When there is no such scheduler, or its workers cannot do it.
-    ClusterLostError
+    WorkersLostError
         When the scheduler or all workers go away.
     """
     client = _connect(address)
@@ -184,20 +226,20 @@ def _compute(
         if not finished:
             time.sleep(LOOK_S)
             if client.status != "running":
-                raise ClusterLostError(f"the scheduler at {address} has gone away")
+                raise WorkersLostError(f"the scheduler at {address} has gone away")
             there = _workers(client, address)
             for gone in sorted(known - there):
                 say(f"the worker {gone} has gone; what it had is given to others")
             known = there
             alone_since = None if there else (alone_since or time.monotonic())
             if alone_since is not None and time.monotonic() - alone_since > NO_WORKERS_S:
-                raise ClusterLostError(f"the scheduler at {address} has had no workers for {NO_WORKERS_S:g} s")
+                raise WorkersLostError(f"the scheduler at {address} has had no workers for {NO_WORKERS_S:g} s")
         for future in finished:
             batch = running.pop(future)
             try:
                 yield batch, future.result()
             except (CancelledError, CommClosedError) as error:
-                raise ClusterLostError(f"the scheduler at {address} has gone away") from error
+                raise WorkersLostError(f"the scheduler at {address} has gone away") from error
             except KilledWorker:
                 say(f"{batch.name} killed their workers and are left out")
                 yield batch, None
@@ -217,4 +259,4 @@ def _workers(client: Client, address: str) -> set[str]:
     try:
         return set(client.scheduler_info(n_workers=-1)["workers"])
     except (OSError, TimeoutError) as error:
-        raise ClusterLostError(f"the scheduler at {address} has gone away") from error
+        raise WorkersLostError(f"the scheduler at {address} has gone away") from error

@@ -222,6 +222,7 @@ def outcome(run: session.Session, mode: int = session.MODE_RUN) -> str | None:
         fault = f", fault {whole[session.FAULT]}, emergency {whole[session.EMERGENCY]:04X}h" if on_purpose else ""
         wanted = session.MODE_NAMES[mode]
         return f"the ECU is in {ended}, not in {wanted} (last refusal {whole[session.LAST_REFUSAL]}{fault})"
-    if whole[session.REFUSED] and not on_purpose:
-        return f"the ECU refused {whole[session.REFUSED]} requests (last reason {whole[session.LAST_REFUSAL]})"
+    refused = whole[session.REFUSED] - run.progress.index[session.ASKED_AGAIN]
+    if refused > 0 and not on_purpose:
+        return f"the ECU refused {refused} requests (last reason {whole[session.LAST_REFUSAL]})"
     return None

@@ -39,6 +39,7 @@ from sil_plant.plant.dynamics import STATES, PlantParameters, plant_parameters, 
 
 ARM_AFTER_S = 0.06  # of standstill, until RUN is requested
 MOVE_AFTER_S = 0.1  # of standstill, until motion starts
+ASK_AGAIN_TICKS = 10  # so long after a request for RUN that did not lead there, until motion starts
 TARE_REQUEST_S = 0.05
 PARKED_S = 0.25  # with the pump off, where the pressures are tared
 CONTROLLERS = ("pid", "diarc-noload", "diarc")
@@ -151,6 +152,7 @@ class Schedule(NamedTuple):
 
     frame_tick: np.ndarray
     frame_row: np.ndarray
+    run_row: np.ndarray  # the request for RUN, with a counter that is neither the last nor the next one
     move_tick: np.ndarray
     move_joint: np.ndarray
     move_target: np.ndarray
@@ -199,7 +201,7 @@ class Session(NamedTuple):
     faulty: bool  # the injection has rows; a scalar, because looking into a tuple of arrays takes time
 
 
-TICK, NEXT_FRAME, NEXT_MOVE, NEXT_LOAD = range(4)
+TICK, NEXT_FRAME, NEXT_MOVE, NEXT_LOAD, ASKED_AGAIN = range(5)
 SYNC_COUNTERS = 240  # CiA 301, 1019h
 VALVE_ACTIVE = 7  # CiA 408
 
@@ -285,12 +287,9 @@ def make_schedule(
     if timeline.parked:
         rows.append((round(TARE_REQUEST_S / period_s), motion_frame(counter, REQUEST_TARE)))
         counter += 1
-    rows.append(
-        (
-            timeline.run_request,
-            motion_frame(counter, start_request, controller=CONTROLLERS.index(controller)),
-        )
-    )
+    which = CONTROLLERS.index(controller)
+    rows.append((timeline.run_request, motion_frame(counter, start_request, controller=which)))
+    run_row = motion_frame(counter + E2E_STATES // 2, start_request, controller=which)
     move_tick, move_joint, move_target, move_ticks = [], [], [], []
     for time_s, joint, segment in moves(scenario):
         counter += 1
@@ -310,6 +309,7 @@ def make_schedule(
     return Schedule(
         frame_tick=np.array([tick for tick, _ in rows], dtype=np.int64),
         frame_row=np.array([row for _, row in rows], dtype=np.uint8),
+        run_row=run_row,
         move_tick=np.array(move_tick, dtype=np.int64),
         move_joint=np.array(move_joint, dtype=np.int64),
         move_target=np.array(move_target, dtype=np.float64),
@@ -406,7 +406,7 @@ def make_session(
             theta_sd=np.full(len(THETA), np.nan),
         ),
         schedule=make_schedule(scenario, controller, timeline, start_request),
-        progress=Progress(np.zeros(4, dtype=np.int64), np.zeros((2, 4))),
+        progress=Progress(np.zeros(5, dtype=np.int64), np.zeros((2, 4))),
         record=Record(
             state=np.zeros((ticks, STATES)),
             command=np.zeros((ticks, 2)),
@@ -494,7 +494,7 @@ def load_due(session: Session, tick: int) -> None:
 
 @inlined
 def master_frames(session: Session, tick: int, out: np.ndarray) -> int:
-    """Write the master's commands of this tick to ``out``; how many."""
+    """Write the master's commands of this tick to ``out``; how many. RUN is asked for until the ECU is there."""
     schedule, index = session.schedule, session.progress.index
     rows = 0
     while (
@@ -506,6 +506,14 @@ def master_frames(session: Session, tick: int, out: np.ndarray) -> int:
             out[rows, k] = schedule.frame_row[index[NEXT_FRAME], k]
         rows += 1
         index[NEXT_FRAME] += 1
+    since = tick - session.timeline.run_request
+    if 0 < since and tick < session.timeline.motion and since % ASK_AGAIN_TICKS == 0:
+        if session.monitor.whole[MODE] == MODE_STANDBY:  # a frame was lost when it was asked
+            for k in range(FRAME_BYTES):
+                out[rows, k] = schedule.run_row[k]
+            protect(out[rows], ((schedule.run_row[DATA + 1] & 0x0F) + index[ASKED_AGAIN]) % E2E_STATES)
+            rows += 1
+            index[ASKED_AGAIN] += 1
     return rows
 
 

@@ -16,6 +16,8 @@ from typing import Any
 import cantools
 import pytest
 
+from tests.cantools_decode import decoded
+
 ROOT = Path(__file__).resolve().parents[2]
 DBC = ROOT / "can_protocol" / "diarc.dbc"
 LOAD_KG = 2.5
@@ -284,17 +286,10 @@ def test_log_of_candump_is_not_foreign_to_cantools(tour: Tour) -> None:
     assert len(lines) > 15_000
     wanted = [line for line in lines if re.search(r" (181|080|202|182|701|201|000)#", line)]
     sample = "".join(wanted[-4000:])
-    decoded = subprocess.run(
-        [sys.executable, "-m", "cantools", "decode", "--single-line", DBC],
-        input=sample,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    ).stdout
-    loads = [float(text) for text in re.findall(r"ESTIMATE\(.*?Load: ([-0-9.]+) kg", decoded)]
+    text = decoded(sample)
+    loads = [float(number) for number in re.findall(r"ESTIMATE\(.*?Load: ([-0-9.]+) kg", text)]
     assert len(loads) > 50 and any(abs(load - LOAD_KG) < 0.05 for load in loads)
-    assert "Unknown frame id" not in decoded
+    assert "Unknown frame id" not in text
     database = cantools.database.load_file(DBC)
     ids = {int(line.split()[2].split("#")[0], 16) for line in lines}
     names = {database.get_message_by_frame_id(can_id).name for can_id in ids}  # KeyError: a frame not in the DBC

@@ -6,6 +6,8 @@
 #include <string.h>
 
 #include "modes_known.h"
+#include "tests/unit/frames.h"
+#include "tests/unit/parameter_images.h"
 
 enum { SPOOL_MAX = 16384, CONTROL_DISABLED = 1, CONTROL_ACTIVE = 7 };
 
@@ -39,6 +41,16 @@ uint32_t input_u32(struct input *input)
     return low | (uint32_t)input_u16(input) << 16;
 }
 
+void input_numbers(struct input *input, uint8_t count, struct parameter_image *image)
+{
+    for (uint8_t n = 0; n < count; n++) {
+        const uint32_t k = input_u8(input) % PARAMETER_COUNT;
+        const uint16_t upper = input_u16(input);
+        image->bytes[IMAGE_HEADER_BYTES + 4u * k + 2u] = (uint8_t)upper;
+        image->bytes[IMAGE_HEADER_BYTES + 4u * k + 3u] = (uint8_t)(upper >> 8);
+    }
+}
+
 /* ---- what must hold ---- */
 
 static bool is_driving(uint8_t mode)
@@ -62,15 +74,6 @@ static void watch_mode(struct bench *bench)
     }
 }
 
-static uint32_t bits(const uint8_t data[8], unsigned start, unsigned length)
-{
-    uint64_t all = 0;
-    for (unsigned k = 0; k < 8u; k++) {
-        all |= (uint64_t)data[k] << (8u * k);
-    }
-    return (uint32_t)((all >> start) & ((UINT64_C(1) << length) - 1u));
-}
-
 static int32_t spool_limit(int16_t spool)
 {
     return spool < 0 ? -(int32_t)spool : spool;
@@ -78,9 +81,10 @@ static int32_t spool_limit(int16_t spool)
 
 static void watch_valves(struct bench *bench, const struct can_frame_11bit *frame, bool taken)
 {
-    const uint8_t mode = (uint8_t)bits(frame->data, 12, 4);
-    const int16_t spool[JOINTS] = {(int16_t)bits(frame->data, 16, 16), (int16_t)bits(frame->data, 32, 16)};
-    const uint32_t control[JOINTS] = {bits(frame->data, 48, 4), bits(frame->data, 52, 4)};
+    const uint8_t mode = (uint8_t)get_bits(frame->data, 12, 4);
+    const int16_t spool[JOINTS] = {(int16_t)get_bits(frame->data, 16, 16),
+                                   (int16_t)get_bits(frame->data, 32, 16)};
+    const uint32_t control[JOINTS] = {get_bits(frame->data, 48, 4), get_bits(frame->data, 52, 4)};
     must(frame->length == 8u && e2e_intact(0x202, frame->data), "the valve frame is not protected");
     must(mode == (uint8_t)bench->ecu.mode, "the valve frame has another mode than the ECU");
     for (uint8_t i = 0; i < JOINTS; i++) {
@@ -230,18 +234,6 @@ static uint32_t bench_now_us(void *context)
 
 /* ---- the bus's other end ---- */
 
-static void put(uint8_t data[8], unsigned start, unsigned length, int64_t value)
-{
-    for (unsigned k = 0; k < length; k++) {
-        const unsigned bit = start + k;
-        const uint8_t mask = (uint8_t)(1u << (bit % 8u));
-        data[bit / 8u] = (uint8_t)(data[bit / 8u] & ~mask);
-        if ((((uint64_t)value >> k) & 1u) != 0u) {
-            data[bit / 8u] = (uint8_t)(data[bit / 8u] | mask);
-        }
-    }
-}
-
 void bench_queue(struct bench *bench, struct can_frame_11bit frame)
 {
     if (bench->waiting_count < BENCH_WAITING) {
@@ -251,21 +243,26 @@ void bench_queue(struct bench *bench, struct can_frame_11bit frame)
 
 void bench_nmt(struct bench *bench, uint8_t command, uint8_t node)
 {
-    bench_queue(bench, (struct can_frame_11bit){.id = 0, .length = 2, .data = {command, node}});
+    bench_queue(bench, nmt_frame(command, node));
 }
 
 void bench_motion(struct bench *bench, uint8_t request, uint8_t joint, uint8_t controller, int32_t target,
                   uint16_t duration_ms)
 {
-    struct can_frame_11bit frame = {.id = 0x201, .length = 8};
-    put(frame.data, 16, 4, request);
-    put(frame.data, 20, 2, joint);
-    put(frame.data, 22, 2, controller);
-    put(frame.data, 24, 24, target);
-    put(frame.data, 48, 16, duration_ms);
     bench->motion_counter = (uint8_t)((bench->motion_counter + 1u) % E2E_COUNTER_STATES);
-    e2e_protect(0x201, bench->motion_counter, frame.data);
-    bench_queue(bench, frame);
+    bench_queue(bench, motion_frame(request, joint, controller, target, duration_ms, bench->motion_counter));
+}
+
+void bench_any_request(struct bench *bench, struct input *input)
+{
+    const uint8_t choice = input_u8(input);
+    bench_motion(bench, choice & 0x0Fu, 0, choice >> 6, 0, 1);
+}
+
+void bench_any_nmt(struct bench *bench, uint8_t choice, uint8_t node)
+{
+    static const uint8_t commands[] = {1, 1, 2, 128, 129, 130};
+    bench_nmt(bench, commands[choice % sizeof commands], node);
 }
 
 static int32_t noise(struct bench *bench)
@@ -293,16 +290,18 @@ static void follow(struct bench *bench)
     }
 }
 
+static uint8_t sensor_counter(const struct bench *bench, enum sensor_frame which)
+{
+    const unsigned offset = bench->sensors.counter_offset[which];
+    return (uint8_t)((bench->ecu.sync_counter - 1u + offset) % E2E_COUNTER_STATES);
+}
+
 static void queue_sensor(struct bench *bench, enum sensor_frame which, struct can_frame_11bit frame)
 {
     const struct sensors *const s = &bench->sensors;
     if (s->silent[which]) {
         return;
     }
-    const uint8_t counter =
-        (uint8_t)((bench->ecu.sync_counter - 1u + s->counter_offset[which]) % E2E_COUNTER_STATES);
-    put(frame.data, 12, 4, s->status[which]);
-    e2e_protect((uint16_t)frame.id, counter, frame.data);
     if (s->bad_crc[which]) {
         frame.data[0] = (uint8_t)(frame.data[0] ^ 0x55u);
     }
@@ -312,16 +311,19 @@ static void queue_sensor(struct bench *bench, enum sensor_frame which, struct ca
 static void queue_sensors(struct bench *bench)
 {
     const struct sensors *const s = &bench->sensors;
-    struct can_frame_11bit frame = {.id = 0x182, .length = 8};
-    put(frame.data, 16, 24, s->angle[SWING] + noise(bench));
-    put(frame.data, 40, 24, s->angle[WRIST] + noise(bench));
-    queue_sensor(bench, ENCODERS, frame);
+    const int32_t swing = s->angle[SWING] + noise(bench);
+    const int32_t wrist = s->angle[WRIST] + noise(bench);
+    queue_sensor(bench, ENCODERS,
+                 encoders_frame(swing, wrist, s->status[ENCODERS], sensor_counter(bench, ENCODERS)));
     for (uint8_t i = 0; i < JOINTS; i++) {
-        frame = (struct can_frame_11bit){.id = i == SWING ? 0x282 : 0x382, .length = 8};
-        put(frame.data, 16, 16, s->pressure[i][BORE] + noise(bench));
-        put(frame.data, 32, 16, s->pressure[i][ANNULUS] + noise(bench));
-        put(frame.data, 48, 16, s->spool[i]);
-        queue_sensor(bench, i == SWING ? PRESSURES_SWING : PRESSURES_WRIST, frame);
+        const enum sensor_frame which = i == SWING ? PRESSURES_SWING : PRESSURES_WRIST;
+        uint16_t pressure[CHAMBERS];
+        for (uint8_t c = 0; c < CHAMBERS; c++) {
+            pressure[c] = (uint16_t)(s->pressure[i][c] + noise(bench));
+        }
+        queue_sensor(
+            bench, which,
+            pressures_frame(i, pressure, s->spool[i], s->status[which], sensor_counter(bench, which)));
     }
 }
 
@@ -332,10 +334,9 @@ bool bench_start(struct bench *bench, const struct parameter_image *image, uint3
         .sensors = {.plant_follows = true},
         .mode = INIT,
     };
-    static const uint16_t rest[JOINTS][CHAMBERS] = {{10000, 14628}, {8412, 10000}}; /* 3 kg at 0.1 rad */
     for (uint8_t i = 0; i < JOINTS; i++) {
         bench->sensors.angle[i] = 267013;
-        memcpy(bench->sensors.pressure[i], rest[i], sizeof rest[i]);
+        memcpy(bench->sensors.pressure[i], REST_PRESSURE[i], sizeof REST_PRESSURE[i]);
     }
     uint16_t entry = 0;
     return ecu_init(&bench->ecu, image, period_us, &entry) == ECU_OK;

@@ -20,6 +20,8 @@ bool input_over(const struct input *input);
 uint8_t input_u8(struct input *input);
 uint16_t input_u16(struct input *input);
 uint32_t input_u32(struct input *input);
+/* So many of an image's numbers, in the upper halves of their binary32; its CRC is left as it is. */
+void input_numbers(struct input *input, uint8_t count, struct parameter_image *image);
 
 enum sensor_frame { ENCODERS, PRESSURES_SWING, PRESSURES_WRIST, SENSOR_FRAMES };
 
@@ -67,6 +69,10 @@ void bench_nmt(struct bench *bench, uint8_t command, uint8_t node);
 /* A request of a master, well protected. */
 void bench_motion(struct bench *bench, uint8_t request, uint8_t joint, uint8_t controller, int32_t target,
                   uint16_t duration_ms);
+/* Of those that fit the frame's bits, without joint and target. */
+void bench_any_request(struct bench *bench, struct input *input);
+/* The start more often than the others. */
+void bench_any_nmt(struct bench *bench, uint8_t choice, uint8_t node);
 
 /* One tick with the sensors' frames, everything checked. */
 void bench_tick(struct bench *bench);

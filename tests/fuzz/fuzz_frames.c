@@ -2,6 +2,7 @@
 #include <string.h>
 
 #include "bench.h"
+#include "tests/unit/parameter_images.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t length);
 
@@ -34,32 +35,12 @@ static const uint16_t KNOWN_IDS[] = {0x000, 0x080, 0x081, 0x181, 0x182, 0x201, 0
 
 static struct bench bench;
 
-static uint32_t crc32(const uint8_t *bytes, uint32_t length)
-{
-    uint32_t crc = UINT32_MAX;
-    for (uint32_t k = 0; k < length; k++) {
-        crc ^= bytes[k];
-        for (int bit = 0; bit < 8; bit++) {
-            crc = (crc & 1u) != 0u ? (crc >> 1) ^ 0xEDB88320u : crc >> 1;
-        }
-    }
-    return ~crc;
-}
-
 /* The built-in machine with up to three parameters changed; most such machines are refused, which is right. */
 static bool power_on(struct input *input, uint8_t choices)
 {
     struct parameter_image image = default_parameter_image;
-    for (uint8_t n = 0; n < (choices >> 3) % 4u; n++) {
-        const uint32_t k = input_u8(input) % PARAMETER_COUNT;
-        const uint16_t upper = input_u16(input); /* half of binary32 */
-        image.bytes[12u + 4u * k + 2u] = (uint8_t)upper;
-        image.bytes[12u + 4u * k + 3u] = (uint8_t)(upper >> 8);
-    }
-    const uint32_t crc = crc32(image.bytes, PARAMETER_IMAGE_BYTES - 4u);
-    for (uint32_t k = 0; k < 4u; k++) {
-        image.bytes[PARAMETER_IMAGE_BYTES - 4u + k] = (uint8_t)(crc >> (8u * k));
-    }
+    input_numbers(input, (choices >> 3) % 4u, &image);
+    image_seal(&image);
     return bench_start(&bench, &image, PERIODS_US[choices % 8u]);
 }
 
@@ -180,21 +161,17 @@ static void happen(struct input *input, unsigned *ticks_left)
     case SENSOR_TROUBLE:
         sensor_trouble(input);
         break;
-    case REQUEST: {
-        const uint8_t choice = input_u8(input);
-        bench_motion(&bench, choice & 0x0Fu, 0, choice >> 6, 0, 1);
+    case REQUEST:
+        bench_any_request(&bench, input);
         break;
-    }
     case MOVE: {
         const int32_t target = (int16_t)input_u16(input) * 128;
         bench_motion(&bench, REQUEST_MOVE, byte / HAPPENINGS & 1u, 0, target, input_u16(input));
         break;
     }
-    case NETWORK: {
-        static const uint8_t commands[] = {1, 1, 2, 128, 129, 130};
-        bench_nmt(&bench, commands[byte / HAPPENINGS % sizeof commands], input_u8(input) % 4u);
+    case NETWORK:
+        bench_any_nmt(&bench, byte / HAPPENINGS, input_u8(input) % 4u);
         break;
-    }
     case FRAME:
         bench_queue(&bench, frame_of(input));
         break;

@@ -4,8 +4,9 @@
 #include <string.h>
 
 #include "bench.h"
-#include "ecu/crc32.h"
 #include "ecu/store.h"
+#include "tests/unit/frames.h"
+#include "tests/unit/parameter_images.h"
 
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t length);
 
@@ -151,9 +152,7 @@ static bool ask(const uint8_t request[8], struct can_frame_11bit *answer)
         return false;
     }
     requests_left--;
-    struct can_frame_11bit frame = {.id = SDO_REQUEST, .length = 8};
-    memcpy(frame.data, request, 8);
-    bench_queue(&bench, frame);
+    bench_queue(&bench, sdo_frame(request));
     const bool is_due = (request[0] & 0xE0u) != ABORT && bench.ecu.nmt != NMT_STOPPED &&
                         !bench.ecu.restart_requested && bench.sends_refused == 0u;
     tick();
@@ -185,9 +184,8 @@ static uint16_t object_of(struct input *input)
 static void initiate(uint8_t command, uint16_t index, uint8_t sub, uint32_t data,
                      struct can_frame_11bit *answer)
 {
-    const uint8_t request[8] = {
-        command,       (uint8_t)index,       (uint8_t)(index >> 8), sub,
-        (uint8_t)data, (uint8_t)(data >> 8), (uint8_t)(data >> 16), (uint8_t)(data >> 24)};
+    uint8_t request[8];
+    sdo_initiate(request, command, index, sub, data);
     (void)ask(request, answer);
 }
 
@@ -203,19 +201,11 @@ static void load_image(struct input *input)
 {
     struct parameter_image image = bench.ecu.image;
     const uint8_t choice = input_u8(input);
-    for (uint8_t n = 0; n < choice % 4u; n++) {
-        const uint32_t k = input_u8(input) % PARAMETER_COUNT;
-        const uint16_t upper = input_u16(input);
-        image.bytes[12u + 4u * k + 2u] = (uint8_t)upper;
-        image.bytes[12u + 4u * k + 3u] = (uint8_t)(upper >> 8);
-    }
+    input_numbers(input, choice % 4u, &image);
     if ((choice & 0x10u) != 0u) {
         image.bytes[8u + input_u8(input) % 3u] = input_u8(input);
     }
-    const uint32_t crc = crc32_add(CRC32_START, image.bytes, PARAMETER_IMAGE_BYTES - 4u);
-    for (uint32_t k = 0; k < 4u; k++) {
-        image.bytes[PARAMETER_IMAGE_BYTES - 4u + k] = (uint8_t)(crc >> (8u * k));
-    }
+    image_seal(&image);
     if ((choice & 0x20u) != 0u) {
         image.bytes[input_u16(input) % PARAMETER_IMAGE_BYTES] ^= 0x04u;
     }
@@ -291,18 +281,14 @@ static void happen(struct input *input)
     case READ_ALL:
         read_all(input);
         break;
-    case REQUEST: {
-        const uint8_t choice = input_u8(input);
-        bench_motion(&bench, choice & 0x0Fu, 0, choice >> 6, 0, 1);
+    case REQUEST:
+        bench_any_request(&bench, input);
         tick();
         break;
-    }
-    case NETWORK: {
-        static const uint8_t commands[] = {1, 1, 2, 128, 129, 130};
-        bench_nmt(&bench, commands[byte / HAPPENINGS % sizeof commands], 1);
+    case NETWORK:
+        bench_any_nmt(&bench, byte / HAPPENINGS, 1);
         quiet_ticks(1);
         break;
-    }
     case SEND_FAILURE:
         bench.sends_refused = input_u8(input) % 32u;
         bench.refusal = PORT_BUSY;

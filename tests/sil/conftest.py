@@ -26,6 +26,7 @@ from sil_plant.experiments import experiment  # noqa: E402
 from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image  # noqa: E402
 from sil_plant.inputs.scenario import DEFAULT_SCENARIO, Scenario, load_scenario, with_load  # noqa: E402
 from sil_plant.loop import inproc, results, session  # noqa: E402
+from tests.sil.bounded import run_bounded  # noqa: E402
 
 RUN_PY = ROOT_PATH / "sil_plant" / "run.py"
 ECU_BINARY = ROOT_PATH / "firmware" / "diarc_ecu"
@@ -261,26 +262,6 @@ def simulate(machine: Machine, paper: Scenario) -> Simulate:
 def run_py_argv(*arguments: object) -> list[str]:
     """Command line of run.py."""
     return [sys.executable, str(RUN_PY), *map(str, arguments)]
-
-
-def run_bounded(argv: Sequence[str], timeout_s: float = LIMIT_S, **options) -> subprocess.CompletedProcess:
-    """Run a command; at the time limit kill it with all its children, and fail."""
-    with subprocess.Popen(
-        argv,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        **options,
-    ) as process:
-        try:
-            out, err = process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            out, err = process.communicate()
-            pytest.fail(f"still running after {timeout_s} s: {argv}\n{out}\n{err}")
-        return subprocess.CompletedProcess(argv, process.returncode, out, err)
 
 
 @pytest.fixture(scope="session")

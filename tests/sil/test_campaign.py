@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import resource
@@ -11,6 +12,8 @@ import socket
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import psutil
@@ -24,6 +27,7 @@ from sil_plant.campaigning.results import ResultFolder, batches
 from sil_plant.campaigning.sampling import arms
 from sil_plant.campaigning.spec import CAMPAIGNS, Campaign, load_campaign
 from sil_plant.config import ROOT, ConfigError
+from tests.sil.campaign_specs import VARY_LOAD_AND_BORE
 
 CAMPAIGN_PY = ROOT / "tools" / "campaign.py"
 LIMIT_S = 110.0
@@ -53,17 +57,7 @@ commission = false
 scenario = "scenario.toml"
 [limits]
 load_err_kg = 0.05
-[[vary]]
-key = "load_kg"
-distribution = "uniform"
-low = 0
-high = 10
-[[vary]]
-key = "wrist.bore_m"
-distribution = "normal"
-relative = true
-sd = 0.001
-[[vary]]
+{VARY_LOAD_AND_BORE}[[vary]]
 key = "effects.pressure_gain_error"
 distribution = "uniform"
 low = 0
@@ -136,8 +130,36 @@ def test_rows_differ_after_a_worker_died_or_with_two_workers(
     assert run.wait(LIMIT_S) == 0, run.err.read_text()
     assert rows_in(out).equals(truth)
     assert re.search(
-        rf"the worker {busiest.pid} has died \(SIGKILL\) with run \d+; it is replaced", run.err.read_text()
+        rf"the worker {busiest.pid} has died \(SIGKILL\) with run \d+; it is replaced|between two batches; all are",
+        run.err.read_text(),
     )
+
+
+def test_worker_that_dies_without_a_job_takes_the_others_work_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """GIVEN a pool that breaks, as it does when a worker dies between two jobs WHEN it is made anew THEN every job is
+    done once, and it is said; WHEN every one breaks THEN that is an error, not a loop.
+    """
+    breaks = 1
+
+    class Pool(pool.ProcessPool):
+        def schedule(self, *arguments, **options):
+            nonlocal breaks
+            if breaks == 0:
+                return super().schedule(*arguments, **options)
+            breaks -= 1
+            future = Future()
+            future.set_exception(BrokenProcessPool("All workers expired"))
+            return future
+
+    monkeypatch.setattr(pool, "ProcessPool", Pool)
+    said: list[str] = []
+    jobs = [(k, (k,)) for k in range(5)]
+    done = dict(pool.in_processes(math.factorial, jobs, 2, said.append, str))
+    assert done == {k: math.factorial(k) for k in range(5)}
+    assert len(said) == 1 and "all are replaced" in said[0]
+    breaks = 10**6
+    with pytest.raises(pool.WorkersLostError, match="die before they begin"):
+        dict(pool.in_processes(math.factorial, jobs, 2, said.append, str))
 
 
 def test_rows_differ_or_work_is_lost_after_a_kill(spec: Path, truth: pa.Table, tmp_path: Path, start) -> None:

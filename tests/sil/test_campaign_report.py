@@ -16,23 +16,14 @@ from sil_plant.campaigning.results import schema
 from sil_plant.campaigning.sampling import arms
 from sil_plant.campaigning.spec import Campaign, load_campaign
 from sil_plant.reports import campaign_report as report
+from tests.sil.campaign_specs import VARY_LOAD_AND_BORE
 
 SPEC = """name = "made up"
 runs = {runs}
 sampling = "{sampling}"
 [limits]
 load_err_kg = 0.02
-[[vary]]
-key = "load_kg"
-distribution = "uniform"
-low = 0
-high = 10
-[[vary]]
-key = "wrist.bore_m"
-distribution = "normal"
-relative = true
-sd = 0.001
-[[vary]]
+{vary}[[vary]]
 key = "wrist.coulomb_Nm"
 distribution = "uniform"
 relative = true
@@ -48,7 +39,7 @@ def made(tmp_path: Path) -> Made:
 
     def make(runs: int, sampling: str = "latin-hypercube", failed: int = 0) -> tuple[Campaign, pa.Table]:
         path = tmp_path / "made.toml"
-        path.write_text(SPEC.format(runs=runs, sampling=sampling), encoding="utf-8")
+        path.write_text(SPEC.format(runs=runs, sampling=sampling, vary=VARY_LOAD_AND_BORE), encoding="utf-8")
         campaign = load_campaign(path)
         chance = np.random.default_rng(7)
         rows = []

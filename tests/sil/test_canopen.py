@@ -13,6 +13,7 @@ import struct
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,6 +71,7 @@ class IoNode(threading.Thread):
         self.silent = threading.Event()
         self.ended = threading.Event()
         self.error: BusError | None = None
+        self.services: deque[tuple[float, int, str]] = deque(maxlen=6)  # told when a test fails
         self.answers = [[packed(name, counter, **AT_REST[name]) for name in IO_FRAMES] for counter in range(15)]
 
     def run(self) -> None:
@@ -77,7 +79,11 @@ class IoNode(threading.Thread):
         try:
             while not self.ended.is_set():
                 frame = self.port.receive(0.05)
-                if frame is not None and frame[0] == protocol.SYNC_ID and not self.silent.is_set():
+                if frame is None:
+                    continue
+                if frame[0] in (0x601, 0x581):
+                    self.services.append((time.monotonic(), frame[0], frame[1].hex()))
+                if frame[0] == protocol.SYNC_ID and not self.silent.is_set():
                     self.port.send_many(self.answers[(frame[1][0] - 1) % 15])
         except BusError as error:
             self.error = error
@@ -174,6 +180,7 @@ def bench(shared: Bench) -> Iterator[Bench]:
         yield shared
         assert process.poll() is None, (shared.folder / "ecu.err").read_text()
     finally:
+        print("now", time.monotonic(), "last SDO on the bus", *shared.io.services, sep="\n")
         process.terminate()
         try:
             process.wait(LIMIT_S)

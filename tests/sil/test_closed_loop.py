@@ -7,13 +7,16 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sil_plant.bus import protocol
-from sil_plant.loop import results, session
+from sil_plant.bus import frames, protocol
+from sil_plant.inputs.machine import Machine
+from sil_plant.inputs.scenario import Scenario, with_load
+from sil_plant.loop import execution, inproc, results, session
 
 KEYS = (
     "load_true_kg load_est_kg load_err_kg load_settle_s peak_err_rad peak_err_after_1s_rad rms_err_rad rho_s "
@@ -235,3 +238,32 @@ def test_csv_is_not_another_run_than_the_json(main, tmp_path: Path, simulate) ->
         ("load_est_kg", record.load_est), ("load_true_kg", record.load_true),
     ]:  # fmt: skip
         assert [float(row[column]) for row in rows] == pytest.approx(values.tolist(), rel=1e-8, abs=1e-12), column
+
+
+@pytest.mark.parametrize("lost", ["ENCODERS", "MOTION"])
+def test_frame_lost_when_run_is_requested_does_not_leave_the_arm_at_rest(
+    machine: Machine, image: bytes, paper: Scenario, lost: str
+) -> None:
+    """GIVEN a frame that is lost in the tick of the request for RUN WHEN the run goes on
+    THEN the ECU is asked again, drives before the first move, takes the moves and the run counts as a good one.
+    """
+    scenario = replace(with_load(paper, 3.0), duration_s=0.5)
+    ecu = inproc.InprocEcu(image)
+    run = session.make_session(machine, scenario, "diarc", 1, 1e-3, False)
+    out = np.zeros((session.OUT_ROWS, frames.FRAME_BYTES), dtype=np.uint8)
+    for tick in range(len(run.noise)):
+        rows = 0
+        for row in ecu.tick_begin():
+            if frames.frame_id(row) == protocol.SYNC_ID:
+                rows = session.on_sync(run, int(row[frames.DATA]), out)
+        arrived = out[:rows]
+        if tick == run.timeline.run_request:
+            arrived = np.array([row for row in arrived if frames.frame_id(row) != protocol.frame_id(lost)])
+            assert len(arrived) == rows - 1
+        for row in ecu.tick_end(np.ascontiguousarray(arrived)):
+            session.on_frame(run, row)
+        assert (run.record.mode[tick] == session.MODE_RUN) == (
+            tick > run.timeline.run_request + session.ASK_AGAIN_TICKS
+        )
+    assert execution.outcome(run) is None
+    assert run.record.reference[-1, 0] > 0.05

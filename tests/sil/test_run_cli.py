@@ -26,17 +26,10 @@ from sil_plant.bus import protocol
 from sil_plant.bus.ports import connect_python_can
 from sil_plant.inputs.machine import REFERENCE_ARM
 from sil_plant.inputs.scenario import DEFAULT_SCENARIO
+from sil_plant.monitoring.host import kernel_has_can
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 30.0  # no wait in this file is longer; reaching it is a failure
-
-
-def has_can() -> bool:
-    try:
-        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
-    except (OSError, AttributeError):
-        return False
-    return True
 
 
 # ---- bad input -----------------------------------------------------------------------------------
@@ -165,7 +158,7 @@ def bad(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ended]:
         for name, edit in files.items():
             (folder / name).write_text(change(good, *edit), "utf-8")
             lines[name] = 1 + (edit[0].join(good.split(edit[0])[: edit[2]])).count("\n")
-    names = [name for name in BAD if name != "vcan0 without CAN" or not has_can()]
+    names = [name for name in BAD if name != "vcan0 without CAN" or not kernel_has_can()]
     with socket.create_server(("127.0.0.1", 0)) as holder:
         busy = str(holder.getsockname()[1])
         cases = {
@@ -367,6 +360,11 @@ def processes_with(word: str) -> list[str]:
     return found
 
 
+def long_run(folder: Path) -> list[object]:
+    """Arguments of a run that is to be broken off, and of what it then leaves."""
+    return ["--duration", 60, "--json", folder / "r.json", "--csv", folder / "t.csv"]
+
+
 def check_outputs(folder: Path) -> int:
     """The ticks of a run that was broken off; its JSON and CSV are whole and of one length."""
     found = json.loads((folder / "r.json").read_text("utf-8"))
@@ -384,7 +382,7 @@ def test_ecu_that_dies_does_not_hang_or_spoil_the_run(tmp_path: Path, start_run_
     """
     port = free_port()
     bus = f"tcp:127.0.0.1:{port}"
-    run = start_run_py("--bus", bus, "--duration", 60, "--json", tmp_path / "r.json", "--csv", tmp_path / "t.csv")
+    run = start_run_py("--bus", bus, *long_run(tmp_path))
     assert hub_of(run) == bus
     ecu = start_ecu(bus)
     wait_for_motion(bus)
@@ -408,18 +406,7 @@ def test_interrupted_run_does_not_leave_anything_behind(tmp_path: Path, start_ru
     """
     port = free_port()
     bus = f"tcp:127.0.0.1:{port}"
-    run = start_run_py(
-        "--bus",
-        bus,
-        "--ecu",
-        "spawn",
-        "--duration",
-        60,
-        "--json",
-        tmp_path / "r.json",
-        "--csv",
-        tmp_path / "t.csv",
-    )
+    run = start_run_py("--bus", bus, "--ecu", "spawn", *long_run(tmp_path))
     wait_for_motion(bus)
     assert any("diarc_ecu" in line for line in processes_with(bus))
     if how == "terminal":
@@ -442,18 +429,7 @@ def test_spawned_ecu_that_dies_is_not_waited_for(tmp_path: Path, start_run_py) -
     THEN status 1, the outputs, and one line that tells its status.
     """
     bus = f"tcp:127.0.0.1:{free_port()}"
-    run = start_run_py(
-        "--bus",
-        bus,
-        "--ecu",
-        "spawn",
-        "--duration",
-        60,
-        "--json",
-        tmp_path / "r.json",
-        "--csv",
-        tmp_path / "t.csv",
-    )
+    run = start_run_py("--bus", bus, "--ecu", "spawn", *long_run(tmp_path))
     wait_for_motion(bus)
     children = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
     ours = [pid for pid in children if b"diarc_ecu" in Path(f"/proc/{pid}/cmdline").read_bytes()]
@@ -469,16 +445,7 @@ def test_ecu_that_restarts_in_a_run_is_not_taken_for_the_same(tmp_path: Path, st
     """GIVEN a run under way WHEN the ECU is reset by somebody's NMT
     THEN status 1, outputs, and one line that says so.
     """
-    run = start_run_py(
-        "--bus",
-        "tcp:127.0.0.1:0",
-        "--duration",
-        60,
-        "--json",
-        tmp_path / "r.json",
-        "--csv",
-        tmp_path / "t.csv",
-    )
+    run = start_run_py("--bus", "tcp:127.0.0.1:0", *long_run(tmp_path))
     bus = hub_of(run)
     start_ecu(bus)
     wait_for_motion(bus)

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.cantools_decode import decoded
+
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 300.0
 
@@ -47,15 +49,8 @@ def test_log_over_tcp_is_not_foreign_to_cantools(seen: dict[str, Any]) -> None:
     log = (seen["folder"] / "out" / "drive.log").read_text()
     assert len(log.splitlines()) > 1000
     sample = "".join(f"{line}\n" for line in log.splitlines() if " 181#" in line)
-    decoded = subprocess.run(
-        [sys.executable, "-m", "cantools", "decode", "--single-line", ROOT / "can_protocol" / "diarc.dbc"],
-        input=sample,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    ).stdout
-    assert "ESTIMATE(" in decoded and " kg" in decoded
+    lines = decoded(sample)
+    assert "ESTIMATE(" in lines and " kg" in lines
 
 
 @pytest.mark.timeout(LIMIT_S)

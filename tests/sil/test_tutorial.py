@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -27,6 +26,7 @@ from pathlib import Path
 import pytest
 
 from sil_plant.bus.hub import Hub
+from tests.sil.bounded import run_bounded
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial.md"
@@ -134,23 +134,9 @@ def bus() -> Iterator[str]:
 
 def run(script: str, folder: Path, environment: dict[str, str]) -> tuple[int, str]:
     """Run a script as the reader's shell does; its status and all that was printed. Nothing of it stays behind."""
-    with subprocess.Popen(
-        ["bash", "-c", script],
-        cwd=folder,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    ) as process:
-        try:
-            out, _ = process.communicate(timeout=LIMIT_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            out, _ = process.communicate()
-            pytest.fail(f"still running after {LIMIT_S} s: {script}\n{out}")
-        return process.returncode, out
+    argv = ["bash", "-c", script]
+    done = run_bounded(argv, LIMIT_S, cwd=folder, env=environment, stderr=subprocess.STDOUT)
+    return done.returncode, done.stdout
 
 
 def do(block: Block, folder: Path, environment: dict[str, str]) -> None:

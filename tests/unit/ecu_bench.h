@@ -40,9 +40,6 @@ static struct {
     uint32_t step_us;
 } bus;
 
-/* An arm that rests at 0.1 rad with 3 kg: pressures in bar. */
-static const double REST_BAR[JOINTS][CHAMBERS] = {{50, 73.14}, {42.06, 50}};
-
 /* What the sensors say. */
 static struct {
     int32_t angle[JOINTS];
@@ -137,8 +134,7 @@ static inline void power_on(const struct parameter_image *image, uint32_t period
     motion_counter = 0;
     for (uint8_t i = 0; i < JOINTS; i++) {
         sensors.angle[i] = angle_raw(0.1);
-        sensors.pressure[i][BORE] = (uint16_t)(REST_BAR[i][BORE] * RAW_PER_BAR);
-        sensors.pressure[i][ANNULUS] = (uint16_t)(REST_BAR[i][ANNULUS] * RAW_PER_BAR);
+        memcpy(sensors.pressure[i], REST_PRESSURE[i], sizeof sensors.pressure[i]);
     }
     TEST_ASSERT_EQUAL_INT(ECU_OK, ecu_init(&ecu, image, period_us, &entry));
     if (!sensors_agree) {
@@ -170,21 +166,14 @@ static inline void queue(struct can_frame_11bit frame)
 
 static inline void queue_nmt(uint8_t command, uint8_t node)
 {
-    queue((struct can_frame_11bit){.id = 0, .length = 2, .data = {command, node}});
+    queue(nmt_frame(command, node));
 }
 
 static inline void queue_request(uint8_t request, uint8_t joint, uint8_t controller, double target_rad,
                                  uint16_t duration_ms)
 {
-    struct can_frame_11bit frame = {.id = 0x201, .length = 8};
-    put_bits(frame.data, 16, 4, request);
-    put_bits(frame.data, 20, 2, joint);
-    put_bits(frame.data, 22, 2, controller);
-    put_bits(frame.data, 24, 24, angle_raw(target_rad));
-    put_bits(frame.data, 48, 16, duration_ms);
-    e2e_protect(0x201, motion_counter, frame.data);
+    queue(motion_frame(request, joint, controller, angle_raw(target_rad), duration_ms, motion_counter));
     motion_counter = (uint8_t)((motion_counter + 1u) % E2E_COUNTER_STATES);
-    queue(frame);
 }
 
 /* A request without joint, target and duration. */
@@ -197,23 +186,11 @@ static inline void queue_sensors(void)
 {
     const uint8_t counter = (uint8_t)((ecu.sync_counter - 1u) % E2E_COUNTER_STATES);
     if (!sensors.silent[0]) {
-        struct can_frame_11bit frame = {.id = 0x182, .length = 8};
-        put_bits(frame.data, 12, 4, sensors.status[0]);
-        put_bits(frame.data, 16, 24, sensors.angle[SWING]);
-        put_bits(frame.data, 40, 24, sensors.angle[WRIST]);
-        e2e_protect(0x182, counter, frame.data);
-        queue(frame);
+        queue(encoders_frame(sensors.angle[SWING], sensors.angle[WRIST], sensors.status[0], counter));
     }
     for (uint8_t i = 0; i < JOINTS; i++) {
         if (!sensors.silent[1 + i]) {
-            const uint16_t id = i == SWING ? 0x282 : 0x382;
-            struct can_frame_11bit frame = {.id = id, .length = 8};
-            put_bits(frame.data, 12, 4, sensors.status[1 + i]);
-            put_bits(frame.data, 16, 16, sensors.pressure[i][BORE]);
-            put_bits(frame.data, 32, 16, sensors.pressure[i][ANNULUS]);
-            put_bits(frame.data, 48, 16, sensors.spool[i]);
-            e2e_protect(id, counter, frame.data);
-            queue(frame);
+            queue(pressures_frame(i, sensors.pressure[i], sensors.spool[i], sensors.status[1 + i], counter));
         }
     }
 }

@@ -92,37 +92,22 @@ static inline void queue(struct can_frame_11bit frame)
 
 static inline void queue_nmt(uint8_t command)
 {
-    queue((struct can_frame_11bit){.id = 0, .length = 2, .data = {command, 1}});
+    queue(nmt_frame(command, 1));
 }
 
 static inline void queue_request(uint8_t request, uint8_t controller)
 {
-    struct can_frame_11bit frame = {.id = 0x201, .length = 8};
-    put_bits(frame.data, 16, 4, request);
-    put_bits(frame.data, 22, 2, controller);
-    put_bits(frame.data, 48, 16, 1);
-    e2e_protect(0x201, wire.motion_counter, frame.data);
+    queue(motion_frame(request, 0, controller, 0, 1, wire.motion_counter));
     wire.motion_counter = (uint8_t)((wire.motion_counter + 1u) % E2E_COUNTER_STATES);
-    queue(frame);
 }
 
 /* Both angles 0.1 rad, pressures that carry the arm with 3 kg. */
 static inline void queue_sensors(void)
 {
-    static const uint16_t pressure[JOINTS][CHAMBERS] = {{10000, 14628}, {8412, 10000}};
     const uint8_t counter = (uint8_t)((ecu.sync_counter - 1u) % E2E_COUNTER_STATES);
-    struct can_frame_11bit encoders = {.id = 0x182, .length = 8};
-    put_bits(encoders.data, 16, 24, 267017);
-    put_bits(encoders.data, 40, 24, 267017);
-    e2e_protect(0x182, counter, encoders.data);
-    queue(encoders);
+    queue(encoders_frame(267017, 267017, 0, counter));
     for (uint8_t i = 0; i < JOINTS; i++) {
-        const uint16_t id = i == SWING ? 0x282 : 0x382;
-        struct can_frame_11bit frame = {.id = id, .length = 8};
-        put_bits(frame.data, 16, 16, pressure[i][BORE]);
-        put_bits(frame.data, 32, 16, pressure[i][ANNULUS]);
-        e2e_protect(id, counter, frame.data);
-        queue(frame);
+        queue(pressures_frame(i, REST_PRESSURE[i], 0, 0, counter));
     }
 }
 
@@ -203,9 +188,7 @@ static inline void to_fault(void)
 /* One request, one tick; the answer, or NULL. Never two. */
 static inline const uint8_t *ask(const uint8_t request[8])
 {
-    struct can_frame_11bit frame = {.id = SDO_REQUEST_ID, .length = 8};
-    memcpy(frame.data, request, 8);
-    queue(frame);
+    queue(sdo_frame(request));
     tick();
     const struct can_frame_11bit *const answer = sent(SDO_ANSWER_ID);
     if (answer == NULL) {
@@ -222,9 +205,8 @@ static inline const uint8_t *ask(const uint8_t request[8])
 
 static inline const uint8_t *ask_for(uint8_t command, uint16_t index, uint8_t sub, uint32_t data)
 {
-    const uint8_t request[8] = {
-        command,       (uint8_t)index,       (uint8_t)(index >> 8), sub,
-        (uint8_t)data, (uint8_t)(data >> 8), (uint8_t)(data >> 16), (uint8_t)(data >> 24)};
+    uint8_t request[8];
+    sdo_initiate(request, command, index, sub, data);
     const uint8_t *const answer = ask(request);
     TEST_ASSERT_NOT_NULL_MESSAGE(answer, "no answer");
     return answer;

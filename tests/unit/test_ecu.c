@@ -298,7 +298,8 @@ static unsigned story(struct can_frame_11bit *log)
             const double q = k > 20 ? real(trajectory_now(reference).q) : 0.1;
             sensors.angle[i] = angle_raw(q + 1e-4 * lcg_uniform(&noise, -1, 1));
             for (uint8_t c = 0; c < CHAMBERS; c++) {
-                sensors.pressure[i][c] = pressure_raw(REST_BAR[i][c] + 0.5 * lcg_uniform(&noise, -1, 1));
+                sensors.pressure[i][c] = pressure_raw((double)REST_PRESSURE[i][c] / RAW_PER_BAR +
+                                                      0.5 * lcg_uniform(&noise, -1, 1));
             }
             sensors.spool[i] = (int16_t)(300 * lcg_uniform(&noise, -1, 1));
         }

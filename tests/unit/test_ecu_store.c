@@ -2,7 +2,13 @@
 #include "ecu/ecu.h"
 #include "testing.h"
 
-enum { REQUEST_RUN = 2, REQUEST_RESET_FAULT = 4, NMT_START = 1, NMT_RESET = 129 };
+enum {
+    REQUEST_RUN = 2,
+    REQUEST_RESET_FAULT = 4,
+    NMT_START = 1,
+    NMT_RESET = 129,
+    NMT_RESET_COMMUNICATION = 130
+};
 
 static struct ecu ecu;
 static struct parameter_image buffer;
@@ -70,7 +76,7 @@ static uint32_t port_now_us(void *context)
     return 0;
 }
 
-static const struct ecu_port PORT = {.send = port_send, .receive = port_receive, .now_us = port_now_us};
+static struct ecu_port port = {.send = port_send, .receive = port_receive, .now_us = port_now_us};
 
 static void queue(struct can_frame_11bit frame)
 {
@@ -79,46 +85,32 @@ static void queue(struct can_frame_11bit frame)
 
 static void queue_nmt(uint8_t command)
 {
-    queue((struct can_frame_11bit){.id = 0, .length = 2, .data = {command, 0}});
+    queue(nmt_frame(command, 0));
 }
 
 static void queue_request(uint8_t request)
 {
     static uint8_t counter;
-    struct can_frame_11bit frame = {.id = 0x201, .length = 8};
-    put_bits(frame.data, 16, 4, request);
-    put_bits(frame.data, 48, 16, 1);
     counter = (uint8_t)((counter + 1u) % E2E_COUNTER_STATES);
-    e2e_protect(0x201, counter, frame.data);
-    queue(frame);
+    queue(motion_frame(request, 0, 0, 0, 1, counter));
 }
 
 /* An arm that rests at 0.1 rad with 3 kg. */
 static void queue_sensors(void)
 {
     const uint8_t counter = (uint8_t)((ecu.sync_counter - 1u) % E2E_COUNTER_STATES);
-    struct can_frame_11bit encoders = {.id = 0x182, .length = 8};
-    put_bits(encoders.data, 16, 24, 267013);
-    put_bits(encoders.data, 40, 24, 267013);
-    e2e_protect(0x182, counter, encoders.data);
-    queue(encoders);
-    static const double rest_bar[JOINTS][CHAMBERS] = {{50, 73.14}, {42.06, 50}};
+    queue(encoders_frame(267013, 267013, 0, counter));
     for (uint8_t i = 0; i < JOINTS; i++) {
-        const uint16_t id = i == SWING ? 0x282 : 0x382;
-        struct can_frame_11bit pressures = {.id = id, .length = 8};
-        put_bits(pressures.data, 16, 16, (int64_t)(rest_bar[i][BORE] * 200));
-        put_bits(pressures.data, 32, 16, (int64_t)(rest_bar[i][ANNULUS] * 200));
-        e2e_protect(id, counter, pressures.data);
-        queue(pressures);
+        queue(pressures_frame(i, REST_PRESSURE[i], 0, 0, counter));
     }
 }
 
 static void tick(void)
 {
-    ecu_tick_begin(&ecu, &PORT);
+    ecu_tick_begin(&ecu, &port);
     queue_sensors();
-    TEST_ASSERT_TRUE(ecu_tick_receive(&ecu, &PORT));
-    ecu_tick_end(&ecu, &PORT);
+    TEST_ASSERT_TRUE(ecu_tick_receive(&ecu, &port));
+    ecu_tick_end(&ecu, &port);
 }
 
 static void ticks(int count)
@@ -139,6 +131,8 @@ void setUp(void)
 {
     memset(slots, 0xFF, sizeof slots);
     valves_opened = false;
+    port.store = NULL;
+    port.fallback = NULL;
     stored_set = default_parameter_image;
     image_set_u32(&stored_set, IMAGE_HEADER_BYTES, 0x41000000u); /* gravity 8 m/s^2 */
     image_seal(&stored_set);
@@ -256,6 +250,54 @@ static void test_wrong_fallback_started_from(void)
     TEST_ASSERT_EQUAL_INT(ECU_IMAGE_NOT_ONE, power_on(&STORE, &stored_set));
 }
 
+/* What NMT makes of an ECU that runs with the defaults, with the store as it is now. */
+static void reset_by(uint8_t command)
+{
+    queue_nmt(command);
+    ticks(2);
+}
+
+static void test_reset_keeps_what_power_on_would_not(void)
+{
+    /* GIVEN a set saved, or restored, since power-on WHEN the node is reset THEN it has the set of the next power-on;
+     * WHEN only communication is THEN the one in force */
+    TEST_ASSERT_EQUAL_INT(ECU_OK, power_on(&STORE, NULL));
+    port.store = &STORE;
+    save();
+    reset_by(NMT_RESET_COMMUNICATION);
+    expect_stored(false);
+    reset_by(NMT_RESET);
+    expect_stored(true);
+    TEST_ASSERT_EQUAL_INT(STORE_OK, store_restore_default(&STORE));
+    reset_by(NMT_RESET_COMMUNICATION);
+    expect_stored(true);
+    queue_nmt(NMT_RESET_COMMUNICATION);
+    reset_by(NMT_RESET);
+    expect_stored(false);
+    TEST_ASSERT_EQUAL_INT(MODE_INIT, ecu.mode);
+    TEST_ASSERT_EQUAL_UINT8(0, emergency_count);
+}
+
+static void test_reset_without_a_whole_set_starts_from_the_wrong_one(void)
+{
+    /* GIVEN an empty store WHEN the node is reset THEN it has the set of its port to fall back on; GIVEN one that this
+     * firmware refuses THEN the same, in FAULT */
+    TEST_ASSERT_EQUAL_INT(ECU_OK, power_on(&STORE, NULL));
+    port.store = &STORE;
+    port.fallback = &stored_set;
+    reset_by(NMT_RESET);
+    expect_stored(true);
+    struct parameter_image refused = stored_set;
+    image_set_u32(&refused, IMAGE_HEADER_BYTES, 0x42000000u); /* 32 m/s^2 */
+    image_seal(&refused);
+    TEST_ASSERT_EQUAL_INT(STORE_OK, store_save(&STORE, &refused));
+    port.fallback = NULL;
+    reset_by(NMT_RESET);
+    expect_stored(false);
+    TEST_ASSERT_EQUAL_INT(MODE_FAULT, ecu.mode);
+    TEST_ASSERT_EQUAL_INT(FAULT_STORE_DAMAGED, ecu.fault);
+}
+
 int main(void)
 {
     UNITY_BEGIN();
@@ -265,5 +307,7 @@ int main(void)
     RUN_TEST(test_older_set_used_in_silence);
     RUN_TEST(test_stored_set_this_firmware_refuses_stops_the_start);
     RUN_TEST(test_wrong_fallback_started_from);
+    RUN_TEST(test_reset_keeps_what_power_on_would_not);
+    RUN_TEST(test_reset_without_a_whole_set_starts_from_the_wrong_one);
     return UNITY_END();
 }

@@ -1,5 +1,4 @@
-/* What several unit tests need: numbers of every type, units, seeded noise, frames bit by bit, the reference
- * machine. */
+/* What several unit tests need: numbers of every type, units, seeded noise, the reference machine. */
 #ifndef TESTING_H
 #define TESTING_H
 
@@ -9,9 +8,9 @@
 #include <stdio.h>
 #include <string.h>
 
-#include "ecu/e2e.h"
 #include "ecu/parameters.h"
-#include "ecu/port.h"
+#include "tests/unit/frames.h"
+#include "tests/unit/parameter_images.h"
 #include "unity.h"
 
 #define COUNT_OF(array) (sizeof(array) / sizeof((array)[0]))
@@ -122,78 +121,12 @@ static inline double lcg_uniform(struct lcg *lcg, double low, double high)
     return low + (high - low) * (double)(lcg->state >> 11) * 0x1p-53;
 }
 
-/* A signal of `length` bits from bit `start` on, as the DBC numbers them for little-endian signals. */
-static inline void put_bits(uint8_t data[8], unsigned start, unsigned length, int64_t value)
-{
-    for (unsigned k = 0; k < length; k++) {
-        const unsigned bit = start + k;
-        const uint8_t mask = (uint8_t)(1u << (bit % 8u));
-        data[bit / 8u] = (uint8_t)(data[bit / 8u] & ~mask);
-        if ((((uint64_t)value >> k) & 1u) != 0u) {
-            data[bit / 8u] = (uint8_t)(data[bit / 8u] | mask);
-        }
-    }
-}
-
-static inline uint32_t get_bits(const uint8_t data[8], unsigned start, unsigned length)
-{
-    uint64_t value = 0;
-    for (unsigned k = 0; k < length; k++) {
-        const unsigned bit = start + k;
-        value |= (uint64_t)((data[bit / 8u] >> (bit % 8u)) & 1u) << k;
-    }
-    return (uint32_t)value;
-}
-
-static inline int32_t get_signed(const uint8_t data[8], unsigned start, unsigned length)
-{
-    const int64_t value = get_bits(data, start, length);
-    return (int32_t)((value >> (length - 1u)) != 0 ? value - ((int64_t)1 << length) : value);
-}
-
-/* A frame of 8 bytes of zeros with good protection. */
-static inline struct can_frame_11bit protected_frame(uint16_t id, uint8_t counter)
-{
-    struct can_frame_11bit frame = {.id = id, .length = 8};
-    e2e_protect(id, counter, frame.data);
-    return frame;
-}
-
 /* The built-in machine. */
 static inline void load_reference_arm(struct machine *machine, struct bases *bases)
 {
     uint16_t entry = 0;
     memset(machine, 0, sizeof *machine);
     TEST_ASSERT_EQUAL_INT(ECU_OK, parameters_load(machine, bases, &default_parameter_image, &entry));
-}
-
-/* Images of parameters: 12 bytes of header, the numbers, CRC-32. */
-#define IMAGE_HEADER_BYTES 12u
-
-static inline uint32_t image_u32(const struct parameter_image *image, uint32_t offset)
-{
-    const uint8_t *const b = &image->bytes[offset];
-    return (uint32_t)b[0] | (uint32_t)b[1] << 8 | (uint32_t)b[2] << 16 | (uint32_t)b[3] << 24;
-}
-
-static inline void image_set_u32(struct parameter_image *image, uint32_t offset, uint32_t value)
-{
-    for (uint32_t k = 0; k < 4u; k++) {
-        image->bytes[offset + k] = (uint8_t)(value >> (8u * k));
-    }
-}
-
-/* Make the CRC right again, by the textbook's bitwise CRC-32. */
-static inline void image_seal(struct parameter_image *image)
-{
-    uint32_t crc = UINT32_MAX;
-    for (uint32_t k = 0; k < PARAMETER_IMAGE_BYTES - 4u; k++) {
-        crc ^= image->bytes[k];
-        for (int bit = 0; bit < 8; bit++) {
-            crc = (crc & 1u) != 0u ? (crc >> 1) ^ 0xEDB88320u : crc >> 1;
-        }
-    }
-    image_set_u32(image, PARAMETER_IMAGE_BYTES - 4u, ~crc);
 }
 
 static inline uint16_t entry_named(const char *name)

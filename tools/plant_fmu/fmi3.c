@@ -142,18 +142,11 @@ fmi3Status fmi3SetFloat64(fmi3Instance handle, const fmi3ValueReference referenc
 
 fmi3Status fmi3GetFMUState(fmi3Instance handle, fmi3FMUState *state)
 {
-    const struct instance *const instance = handle;
+    struct instance *const instance = handle;
     if (instance == NULL || state == NULL) {
         return fmi3Error;
     }
-    if (*state == NULL) {
-        *state = malloc(sizeof(struct plant));
-    }
-    if (*state == NULL) {
-        return not_there(handle, "a state: no memory");
-    }
-    *(struct plant *)*state = instance->plant;
-    return fmi3OK;
+    return done(instance, plant_save(&instance->plant, &instance->plant, state));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance handle, fmi3FMUState state)
@@ -169,10 +162,7 @@ fmi3Status fmi3SetFMUState(fmi3Instance handle, fmi3FMUState state)
 fmi3Status fmi3FreeFMUState(fmi3Instance handle, fmi3FMUState *state)
 {
     (void)handle;
-    if (state != NULL) {
-        free(*state);
-        *state = NULL;
-    }
+    plant_free_saved(state);
     return fmi3OK;
 }
 
@@ -197,17 +187,11 @@ fmi3Status fmi3SerializeFMUState(fmi3Instance handle, fmi3FMUState state, fmi3By
 fmi3Status fmi3DeserializeFMUState(fmi3Instance handle, const fmi3Byte bytes[], size_t size,
                                    fmi3FMUState *state)
 {
-    if (handle == NULL || bytes == NULL || state == NULL || size != sizeof(struct plant)) {
+    struct instance *const instance = handle;
+    if (instance == NULL || bytes == NULL || state == NULL || size != sizeof(struct plant)) {
         return fmi3Error;
     }
-    if (*state == NULL) {
-        *state = malloc(sizeof(struct plant));
-    }
-    if (*state == NULL) {
-        return not_there(handle, "a state: no memory");
-    }
-    (void)memcpy(*state, bytes, sizeof(struct plant));
-    return fmi3OK;
+    return done(instance, plant_save(&instance->plant, bytes, state));
 }
 
 fmi3Status fmi3DoStep(fmi3Instance handle, fmi3Float64 time_s, fmi3Float64 step_s, fmi3Boolean no_return,

@@ -4,6 +4,7 @@
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 /* The compiled equations; 0: all is well. */
 int32_t diarc_plant_step(void **nothing, void **error, double *y, const double *u, double load_kg,
@@ -181,4 +182,24 @@ bool plant_terminate(struct plant *plant)
     }
     plant->phase = PHASE_TERMINATED;
     return true;
+}
+
+bool plant_save(struct plant *plant, const void *bytes, void **state)
+{
+    if (*state == NULL) {
+        *state = malloc(sizeof(struct plant));
+    }
+    if (*state == NULL) {
+        return refuse(plant, "no memory for a state");
+    }
+    (void)memcpy(*state, bytes, sizeof(struct plant));
+    return true;
+}
+
+void plant_free_saved(void **state)
+{
+    if (state != NULL) {
+        free(*state);
+        *state = NULL;
+    }
 }

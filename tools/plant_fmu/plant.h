@@ -48,5 +48,9 @@ bool plant_get(struct plant *plant, uint32_t reference, double *value);
 bool plant_set(struct plant *plant, uint32_t reference, double value);
 bool plant_step(struct plant *plant, double time_s, double step_s);
 bool plant_terminate(struct plant *plant);
+/* Copies a plant's bytes into a saved state, a new one when *state is NULL. */
+bool plant_save(struct plant *plant, const void *bytes, void **state);
+
+void plant_free_saved(void **state);
 
 #endif

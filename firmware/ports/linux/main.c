@@ -180,6 +180,7 @@ static int run(const struct options *options, const char *program)
         return EXIT_WRONG_USE;
     }
     bus->port.store = options->store_path != NULL ? &the_store.port : NULL;
+    bus->port.fallback = options->params_path != NULL ? &the_image : NULL;
     request_realtime(options->pace, program);
     if (!options->quiet) {
         (void)printf("diarc_ecu " DIARC_VERSION " on %s, %s pace, %lu us\n", options->bus,
