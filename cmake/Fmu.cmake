@@ -18,7 +18,7 @@ set(fmu_header "${fmu_folder}/ports/fmu/variables.h")
 file(MAKE_DIRECTORY "${fmu_folder}/ports/fmu")
 set(fmu_export "${PROJECT_SOURCE_DIR}/tools/export_fmu.py")
 diarc_sources(fmu_sources firmware/ports/fmu/*.c)
-file(GLOB fmu_inputs CONFIGURE_DEPENDS "${PROJECT_SOURCE_DIR}/sil_plant/*.py")
+file(GLOB_RECURSE fmu_inputs CONFIGURE_DEPENDS "${PROJECT_SOURCE_DIR}/sil_plant/*.py")
 list(APPEND fmu_inputs "${fmu_export}" "${PROJECT_SOURCE_DIR}/can_protocol/diarc.dbc"
     "${PROJECT_SOURCE_DIR}/can_protocol/parameters.toml" "${PROJECT_SOURCE_DIR}/sil_plant/arms/reference.toml")
 

@@ -16,8 +16,8 @@ _HERE = Path(__file__).resolve().parent
 def _cache_folder() -> Path:
     """Folder of the compiled code of exactly these sources."""
     digest = hashlib.sha256()
-    for path in sorted(_HERE.glob("*.py")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    for path in sorted(_HERE.rglob("*.py")):
+        digest.update(str(path.relative_to(_HERE)).encode() + b"\0" + path.read_bytes())
     base = _HERE.parent / "build"
     if not os.access(base if base.is_dir() else base.parent, os.W_OK):
         base = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "diarc-ecu"

@@ -31,15 +31,13 @@ enter(__file__)
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
 
-from sil_plant import bus_run, execution, inproc, protocol, results, session  # noqa: E402
-from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
-from sil_plant.commissioning import load_commissioned  # noqa: E402
+from sil_plant.bus import protocol  # noqa: E402
+from sil_plant.bus.ports import BusAddress, BusError, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.control import DEFAULT_CONTROL_PORT, Command, Control, Hello  # noqa: E402
-from sil_plant.external_plant import ExternalPlant, PlantLostError  # noqa: E402
-from sil_plant.faults import Fault  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
-from sil_plant.scenario import (  # noqa: E402
+from sil_plant.experiments.commissioning import load_commissioned  # noqa: E402
+from sil_plant.inputs.faults import Fault  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import (  # noqa: E402
     DEFAULT_SCENARIO,
     LONGEST_RUN_S,
     PROFILE_NAMES,
@@ -49,6 +47,9 @@ from sil_plant.scenario import (  # noqa: E402
     load_scenario,
     with_load,
 )
+from sil_plant.loop import bus_run, execution, inproc, results, session  # noqa: E402
+from sil_plant.loop.control_channel import DEFAULT_CONTROL_PORT, Command, Control, Hello  # noqa: E402
+from sil_plant.loop.external_plant import ExternalPlant, PlantLostError  # noqa: E402
 
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 WARM_UP_FAULT = Fault("delayed", "motion", 0.0, 0.001, 1.0)  # compiles the plant that faults may come to

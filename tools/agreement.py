@@ -24,9 +24,9 @@ enter(__file__)
 import numpy as np  # noqa: E402
 
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.experiment import Outcome, commission, setup_for, simulate  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
+from sil_plant.experiments.experiment import Outcome, commission, setup_for, simulate  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
 
 DOCUMENT = ROOT / "docs" / "numbers.md"
 BEGIN, END = "<!-- agreement: made by tools/agreement.py -->", "<!-- end of agreement -->"

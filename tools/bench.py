@@ -34,15 +34,16 @@ from matplotlib.figure import Figure  # noqa: E402
 from numba import njit  # noqa: E402
 from scipy.integrate import solve_ivp  # noqa: E402
 
-from sil_plant import frames, inproc, protocol  # noqa: E402
+from sil_plant.bus import frames, protocol  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.execution import PERIOD_US  # noqa: E402
-from sil_plant.experiment import Setup, setup_for, simulate  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image  # noqa: E402
-from sil_plant.plant import LONGEST_STEP_S, P_SWING, STATES, XV, PlantParameters, derivative  # noqa: E402
-from sil_plant.results import check_writable  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
-from sil_plant.session import Session, make_session, on_frame_plain, on_sync_plain  # noqa: E402
+from sil_plant.experiments.experiment import Setup, setup_for, simulate  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
+from sil_plant.loop import inproc  # noqa: E402
+from sil_plant.loop.execution import PERIOD_US  # noqa: E402
+from sil_plant.loop.results import check_writable  # noqa: E402
+from sil_plant.loop.session import Session, make_session, on_frame_plain, on_sync_plain  # noqa: E402
+from sil_plant.plant.dynamics import LONGEST_STEP_S, P_SWING, STATES, XV, PlantParameters, derivative  # noqa: E402
 from tools import plant_accuracy  # noqa: E402
 from tools.plant_accuracy import CLASSIC, OURS, REFERENCE_STEP_S, Inputs  # noqa: E402
 

@@ -40,12 +40,12 @@ from emulated_board import IMAGES, BoardError, EmulatedBoard, Image  # noqa: E40
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from sil_plant import execution, session  # noqa: E402
-from sil_plant.bus_run import EcuLostError, EcuMissingError  # noqa: E402
-from sil_plant.buses import BusError, parse_bus  # noqa: E402
+from sil_plant.bus.ports import BusError, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, LoadStep, Scenario, load_scenario  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, LoadStep, Scenario, load_scenario  # noqa: E402
+from sil_plant.loop import execution, session  # noqa: E402
+from sil_plant.loop.bus_run import EcuLostError, EcuMissingError  # noqa: E402
 from tools import budget_floor, budget_modes  # noqa: E402
 
 BUDGET_PATH = ROOT / "build" / "budget.json"

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sil_plant import execution, protocol, session
-from sil_plant.frames import frame_id, protect, to_row
-from sil_plant.machine import Machine
-from sil_plant.scenario import LoadStep, Scenario
+from sil_plant.bus import protocol
+from sil_plant.bus.frames import frame_id, protect, to_row
+from sil_plant.inputs.machine import Machine
+from sil_plant.inputs.scenario import LoadStep, Scenario
+from sil_plant.loop import execution, session
 
 SDO_REQUEST_ID = 0x601
 NMT_ENTER_PRE_OPERATIONAL = 128

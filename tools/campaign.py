@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
         return EXIT_WRONG_USE
     take_for_interrupt(signal.SIGTERM)
     # imported here, for the workers that are spawned read this file, too
-    from sil_plant.campaign_pool import WorkersLostError
+    from sil_plant.campaigning.pool import WorkersLostError
 
     try:
         return _main(arguments)
@@ -89,10 +89,10 @@ def main(argv: list[str]) -> int:
 
 
 def _main(arguments: argparse.Namespace) -> int:
-    from sil_plant import campaign_sampling as sampling
-    from sil_plant.campaign_results import ResultFolder, batches
-    from sil_plant.campaign_run import code_hash
-    from sil_plant.campaign_spec import load_campaign
+    from sil_plant.campaigning import sampling
+    from sil_plant.campaigning.arm_run import code_hash
+    from sil_plant.campaigning.results import ResultFolder, batches
+    from sil_plant.campaigning.spec import load_campaign
 
     campaign = load_campaign(arguments.spec, arguments.runs)
     note = sampling.note(campaign)
@@ -116,8 +116,8 @@ def _main(arguments: argparse.Namespace) -> int:
 
 def _run(arguments, campaign, folder, wanted, planned: int, note: str | None) -> int:
     """Compute what is missing, then report on all of it."""
-    from sil_plant import campaign_pool as pool
-    from sil_plant.campaign_run import warm_up
+    from sil_plant.campaigning import pool
+    from sil_plant.campaigning.arm_run import warm_up
 
     workers = arguments.workers or pool.default_workers()
     todo, damaged = folder.missing(wanted)
@@ -154,9 +154,9 @@ def _run(arguments, campaign, folder, wanted, planned: int, note: str | None) ->
 
 def _report(arguments, campaign, folder, wanted, planned: int, notes: tuple[str, ...]) -> str:
     """Write the report; its table for people."""
-    from sil_plant import campaign_report as report
-    from sil_plant.campaign_results import write_whole
-    from sil_plant.campaign_statistics import summary
+    from sil_plant.campaigning.results import write_whole
+    from sil_plant.campaigning.statistics import summary
+    from sil_plant.reports import campaign_report as report
 
     rows = folder.collect(wanted)
     if rows.num_rows == 0:
@@ -177,8 +177,8 @@ def _report(arguments, campaign, folder, wanted, planned: int, notes: tuple[str,
 
 def _table(campaign, folder, wanted, planned: int) -> int:
     """Print the README's table from results that are there."""
-    from sil_plant.campaign_report import readme_table
-    from sil_plant.campaign_statistics import summary
+    from sil_plant.campaigning.statistics import summary
+    from sil_plant.reports.campaign_report import readme_table
 
     if not folder.path.is_dir():
         raise ConfigError(f"{folder.path}: has no results; run the campaign first")
@@ -195,11 +195,12 @@ def _rerun(campaign, arms, folder, number: int) -> int:
     """Run one arm again, print its figures, draw it, and hold it against the results that are there."""
     import pyarrow.parquet as pq
 
-    from sil_plant import campaign_report as report
-    from sil_plant import figures, results
-    from sil_plant.campaign_results import ALL_ROWS
-    from sil_plant.campaign_run import row_of, run_arm, warm_up
-    from sil_plant.protocol import worst_case_bus_load
+    from sil_plant.bus.protocol import worst_case_bus_load
+    from sil_plant.campaigning.arm_run import row_of, run_arm, warm_up
+    from sil_plant.campaigning.results import ALL_ROWS
+    from sil_plant.loop import results
+    from sil_plant.reports import campaign_report as report
+    from sil_plant.reports import figures
 
     if not 1 <= number <= len(arms):
         raise ConfigError(f"--rerun {number}: the campaign has runs 1 to {len(arms)}")

@@ -30,12 +30,13 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.machine import Machine  # noqa: E402
-from sil_plant.machine_check import Case, check_machine, make_case, with_lines  # noqa: E402
-from sil_plant.machine_file import complete_text  # noqa: E402
-from sil_plant.machine_keys import (  # noqa: E402
+from sil_plant.design.check import Case, check_machine, make_case, with_lines  # noqa: E402
+from sil_plant.design.machine_file import complete_text  # noqa: E402
+from sil_plant.design.proposal import Proposal, as_toml, propose  # noqa: E402
+from sil_plant.experiments.commissioning import load_commissioned  # noqa: E402
+from sil_plant.inputs.machine import Machine  # noqa: E402
+from sil_plant.inputs.machine_keys import (  # noqa: E402
     ERROR,
     NOTE,
     SEVERITIES,
@@ -45,9 +46,8 @@ from sil_plant.machine_keys import (  # noqa: E402
     read_keys,
     relation_findings,
 )
-from sil_plant.machine_proposal import Proposal, as_toml, propose  # noqa: E402
-from sil_plant.results import check_writable  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, HEAVIEST_KG, Scenario, load_scenario  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, HEAVIEST_KG, Scenario, load_scenario  # noqa: E402
+from sil_plant.loop.results import check_writable  # noqa: E402
 
 EXIT_NOT_WORKING, EXIT_WRONG_USE = 1, 2
 
@@ -199,7 +199,7 @@ def outputs(
             say(f"check_arm.py: note: the comments of {arguments.machine} could not be kept")
         written.append(str(arguments.write))
     if arguments.plots:
-        from sil_plant.machine_figures import write_plots  # matplotlib only when it is needed
+        from sil_plant.reports.machine_figures import write_plots  # matplotlib only when it is needed
 
         written += write_plots(case, arguments.plots)
     return written

@@ -26,11 +26,13 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import bus_run, commissioning, ecu_parameters, execution, session  # noqa: E402
-from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
+from sil_plant.bus import ecu_parameters  # noqa: E402
+from sil_plant.bus.ports import BusAddress, BusError, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
-from sil_plant.scenario import PROFILE_NAMES, check_scenario, load_profile, load_scenario  # noqa: E402
+from sil_plant.experiments import commissioning  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import PROFILE_NAMES, check_scenario, load_profile, load_scenario  # noqa: E402
+from sil_plant.loop import bus_run, execution, session  # noqa: E402
 
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 

@@ -35,11 +35,12 @@ from sil_plant.environment import enter, say  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import figures, protocol  # noqa: E402
-from sil_plant.buses import BusAddress, BusError, open_frame_port, parse_bus  # noqa: E402
+from sil_plant.bus import protocol  # noqa: E402
+from sil_plant.bus.hub import DEFAULT_PORT  # noqa: E402
+from sil_plant.bus.ports import BusAddress, BusError, open_frame_port, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.host import kernel_has_can  # noqa: E402
-from sil_plant.hub import DEFAULT_PORT  # noqa: E402
+from sil_plant.monitoring.host import kernel_has_can  # noqa: E402
+from sil_plant.reports import figures  # noqa: E402
 
 OUT = ROOT / "out"
 JSON, CSV, PNG = OUT / "demo.json", OUT / "demo.csv", OUT / "demo.png"

@@ -32,11 +32,11 @@ enter(__file__)
 from rich.console import Console  # noqa: E402
 from rich.text import Text  # noqa: E402
 
-from sil_plant.buses import BusError  # noqa: E402
+from sil_plant.bus.ports import BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.diagnosis import Evidence, Finding, diagnose, examine  # noqa: E402
-from sil_plant.listen import joinable  # noqa: E402
-from sil_plant.monitor_view import Place, one_line  # noqa: E402
+from sil_plant.monitoring.diagnosis import Evidence, Finding, diagnose, examine  # noqa: E402
+from sil_plant.monitoring.listen import joinable  # noqa: E402
+from sil_plant.monitoring.view import Place, one_line  # noqa: E402
 from tools.signals import take_for_interrupt  # noqa: E402
 
 EXIT_FINDINGS, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130

@@ -19,10 +19,11 @@ from sil_plant.environment import CommandLine, enter, say  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import ecu_fmu, plant_fmu, results  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, parameter_image, with_changes  # noqa: E402
-from sil_plant.scenario import PROFILE_NAMES, load_profile  # noqa: E402
+from sil_plant.fmu import ecu_fmu, plant_fmu  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, parameter_image, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import PROFILE_NAMES, load_profile  # noqa: E402
+from sil_plant.loop import results  # noqa: E402
 
 
 def main(argv: list[str]) -> int:

@@ -24,12 +24,12 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import execution  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.fault_matrix import Row, benchmark, cells, load_cases, measure, table, unknown_names  # noqa: E402
-from sil_plant.faults import KINDS  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine  # noqa: E402
-from sil_plant.results import check_writable, fault_names  # noqa: E402
+from sil_plant.experiments.fault_matrix import Row, benchmark, cells, load_cases, measure, table, unknown_names  # noqa: E402
+from sil_plant.inputs.faults import KINDS  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine  # noqa: E402
+from sil_plant.loop import execution  # noqa: E402
+from sil_plant.loop.results import check_writable, fault_names  # noqa: E402
 
 CHUNK = 8  # cells that a process takes at a time
 

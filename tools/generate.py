@@ -17,9 +17,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from sil_plant.bus.protocol import DBC_PATH, database, dbc_hash  # noqa: E402
 from sil_plant.config import tomllib  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
-from sil_plant.protocol import DBC_PATH, database, dbc_hash  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
 from tools.object_files import object_files  # noqa: E402
 from tools.protocol_page import protocol_page  # noqa: E402
 

@@ -36,15 +36,15 @@ enter(__file__)
 
 import numpy as np  # noqa: E402
 
-from sil_plant import session  # noqa: E402
-from sil_plant.buses import BusAddress, BusError, parse_bus  # noqa: E402
+from sil_plant.bus.frames import DATA, FRAME_BYTES, frame_id  # noqa: E402
+from sil_plant.bus.ports import BusAddress, BusError, parse_bus  # noqa: E402
+from sil_plant.bus.protocol import SYNC_ID  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.execution import ECU_BINARY  # noqa: E402
-from sil_plant.frames import DATA, FRAME_BYTES, frame_id  # noqa: E402
-from sil_plant.inproc import InprocEcu  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, parameter_image  # noqa: E402
-from sil_plant.protocol import SYNC_ID  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, parameter_image  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
+from sil_plant.loop import session  # noqa: E402
+from sil_plant.loop.execution import ECU_BINARY  # noqa: E402
+from sil_plant.loop.inproc import InprocEcu  # noqa: E402
 
 BIN = ROOT / "build" / "bin"
 PROBE, ECHO = BIN / "latency_probe", BIN / "latency_echo"

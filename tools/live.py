@@ -36,23 +36,23 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import hub  # noqa: E402
-from sil_plant.buses import BusError  # noqa: E402
+from sil_plant.bus import hub  # noqa: E402
+from sil_plant.bus.ports import BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.control import DEFAULT_CONTROL_PORT, HOST  # noqa: E402
-from sil_plant.diagnosis import REFUSALS  # noqa: E402
-from sil_plant.listen import Listener, joinable  # noqa: E402
-from sil_plant.live_plant import OwnPlant, PlantLink, free_port, machine_of  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine  # noqa: E402
-from sil_plant.master import Master  # noqa: E402
-from sil_plant.monitor_view import Place  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, check_scenario, load_scenario  # noqa: E402
-from sil_plant.watch import Snapshot, Watch  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, check_scenario, load_scenario  # noqa: E402
+from sil_plant.live.plant import OwnPlant, PlantLink, free_port, machine_of  # noqa: E402
+from sil_plant.loop.control_channel import DEFAULT_CONTROL_PORT, HOST  # noqa: E402
+from sil_plant.monitoring.diagnosis import REFUSALS  # noqa: E402
+from sil_plant.monitoring.listen import Listener, joinable  # noqa: E402
+from sil_plant.monitoring.master import Master  # noqa: E402
+from sil_plant.monitoring.view import Place  # noqa: E402
+from sil_plant.monitoring.watch import Snapshot, Watch  # noqa: E402
 from tools.signals import take_for_interrupt  # noqa: E402
 
 if TYPE_CHECKING:
-    from sil_plant.live_page import Page, Wish
-    from sil_plant.live_picture import Picture
+    from sil_plant.live.page import Page, Wish
+    from sil_plant.live.picture import Picture
 
 EXIT_FAILED, EXIT_WRONG_USE = 1, 2
 DEFAULT_PORT = 8080
@@ -106,7 +106,7 @@ class Live:
     """
 
     def __init__(self, arguments: argparse.Namespace, stack: contextlib.ExitStack) -> None:
-        from sil_plant.arm_geometry import geometry
+        from sil_plant.plant.geometry import geometry
 
         machine = load_machine(arguments.arm)
         scenario = load_scenario(arguments.scenario)
@@ -144,7 +144,7 @@ class Live:
 
     def run(self, until: Callable[[], bool]) -> None:
         """Listen, show, and do what is asked for, until it is time to end."""
-        from sil_plant.live_page import FRAME_S, View
+        from sil_plant.live.page import FRAME_S, View
 
         next_s = time.monotonic()
         while not until():
@@ -234,7 +234,7 @@ def start_page(port: int, shape: object, repeat: bool, stack: contextlib.ExitSta
     """Open the page's server on the loopback interface."""
     import viser
 
-    from sil_plant.live_page import Page
+    from sil_plant.live.page import Page
 
     with contextlib.redirect_stdout(io.StringIO()):  # its banner
         server = viser.ViserServer(host=HOST, port=port, verbose=False)
@@ -259,8 +259,8 @@ def main(argv: list[str]) -> int:
             live = Live(arguments, stack)
             url = f"http://{HOST}:{arguments.port}"
             if arguments.screenshot:
-                from sil_plant.live_page import Wish
-                from sil_plant.live_picture import Picture
+                from sil_plant.live.page import Wish
+                from sil_plant.live.picture import Picture
 
                 other_load = Wish("load", {"kg": PICTURE_LOAD_KG})
                 picture = Picture(url, arguments.screenshot, lambda: live.page.wishes.put(other_load))

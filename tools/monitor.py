@@ -32,11 +32,11 @@ enter(__file__)
 from rich.console import Console, RenderableType  # noqa: E402
 from rich.live import Live  # noqa: E402
 
-from sil_plant.buses import BusAddress, BusError  # noqa: E402
+from sil_plant.bus.ports import BusAddress, BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.listen import Listener, joinable  # noqa: E402
-from sil_plant.monitor_view import TRACE_POINTS, Place, one_line, page  # noqa: E402
-from sil_plant.watch import Snapshot, Watch  # noqa: E402
+from sil_plant.monitoring.listen import Listener, joinable  # noqa: E402
+from sil_plant.monitoring.view import TRACE_POINTS, Place, one_line, page  # noqa: E402
+from sil_plant.monitoring.watch import Snapshot, Watch  # noqa: E402
 from tools.signals import take_for_interrupt  # noqa: E402
 
 EXIT_NOTHING_HEARD, EXIT_WRONG_USE = 1, 2

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sil_plant.machine import load_parameter_table
-from sil_plant.objects import (
+from sil_plant.bus.objects import (
     DATA_TYPES,
     FIRST_FRAME,
     FIRST_PARAMETER,
@@ -17,6 +16,7 @@ from sil_plant.objects import (
     load_objects,
     version,
 )
+from sil_plant.inputs.machine import load_parameter_table
 
 ECU_DIR = Path("firmware/ecu/generated")
 EDS_FILE = Path("can_protocol/diarc_ecu.eds")
@@ -213,7 +213,7 @@ What a CANopen tool reads and writes by SDO, node 1: requests on 601h, answers o
 
 ```python
 import canopen
-from sil_plant.buses import connect_python_can
+from sil_plant.bus.ports import connect_python_can
 
 network = canopen.Network(connect_python_can("tcp:127.0.0.1:29536"))
 network.connect()

@@ -1,8 +1,8 @@
 """Repeat the paper's results on the simulated arm, and judge them: figures 5 to 8, Table 1, and what goes beyond.
 
 Writes out/paper/report.html (one file, to be opened anywhere), report.json (every run: the keys of run.py --json,
-profile, group, bar; see sil_plant/paper_report.py) and the pictures; refreshes docs/img/paper.png and the README's
-section when all parts are made. The exit status does not depend on bars: 0 when everything ran.
+profile, group, bar; see sil_plant/reports/paper_report.py) and the pictures; refreshes docs/img/paper.png and the
+README's section when all parts are made. The exit status does not depend on bars: 0 when everything ran.
 
 Examples
 --------
@@ -34,15 +34,11 @@ enter(__file__)
 
 from matplotlib.figure import Figure  # noqa: E402
 
-from sil_plant import figures, paper_figures  # noqa: E402
-from sil_plant import paper_report as report  # noqa: E402
-from sil_plant.commissioning import COMMISSION_SCENARIO, UNITS, Finding  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.experiment import Outcome, Setup, commission, commissioning_setup, setup_for, simulate  # noqa: E402
-from sil_plant.machine import ARMS, JOINT_NAMES, Machine, load_machine, with_changes  # noqa: E402
-from sil_plant.paper_report import Bar, Case, ParameterFinding, Report  # noqa: E402
-from sil_plant.results import AFTER_S, LOAD_BAND_KG  # noqa: E402
-from sil_plant.scenario import (  # noqa: E402
+from sil_plant.experiments.commissioning import COMMISSION_SCENARIO, UNITS, Finding  # noqa: E402
+from sil_plant.experiments.experiment import Outcome, Setup, commission, commissioning_setup, setup_for, simulate  # noqa: E402
+from sil_plant.inputs.machine import ARMS, JOINT_NAMES, Machine, load_machine, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import (  # noqa: E402
     SCENARIOS,
     Profile,
     Scenario,
@@ -53,7 +49,11 @@ from sil_plant.scenario import (  # noqa: E402
     moves,
     with_load,
 )
-from sil_plant.session import CONTROLLERS  # noqa: E402
+from sil_plant.loop.results import AFTER_S, LOAD_BAND_KG  # noqa: E402
+from sil_plant.loop.session import CONTROLLERS  # noqa: E402
+from sil_plant.reports import figures, paper_figures  # noqa: E402
+from sil_plant.reports import paper_report as report  # noqa: E402
+from sil_plant.reports.paper_report import Bar, Case, ParameterFinding, Report  # noqa: E402
 
 OUT = ROOT / "out" / "paper"
 README = ROOT / "README.md"

@@ -30,12 +30,12 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import ecu_parameters  # noqa: E402
-from sil_plant.buses import BusError  # noqa: E402
+from sil_plant.bus import ecu_parameters  # noqa: E402
+from sil_plant.bus.ecu_parameters import EcuParameters, RefusedError  # noqa: E402
+from sil_plant.bus.objects import parameter_unit  # noqa: E402
+from sil_plant.bus.ports import BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.ecu_parameters import EcuParameters, RefusedError  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
-from sil_plant.objects import parameter_unit  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image  # noqa: E402
 
 EXIT_DIFFERENT = EXIT_REFUSED = 1
 EXIT_WRONG_USE, EXIT_INTERRUPTED = 2, 130

@@ -28,13 +28,13 @@ enter(__file__)
 
 from numba import njit  # noqa: E402
 
-from sil_plant import injection  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.experiment import Setup, setup_for, simulate  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, with_changes  # noqa: E402
-from sil_plant.plant import LONGEST_STEP_S, P_SWING, STATES, XV, PlantParameters, derivative, integrate  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
-from sil_plant.session import Session  # noqa: E402
+from sil_plant.experiments.experiment import Setup, setup_for, simulate  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_profile, load_scenario, with_load  # noqa: E402
+from sil_plant.loop import injection  # noqa: E402
+from sil_plant.loop.session import Session  # noqa: E402
+from sil_plant.plant.dynamics import LONGEST_STEP_S, P_SWING, STATES, XV, PlantParameters, derivative, integrate  # noqa: E402
 
 REFERENCE_STEP_S = 1e-5
 SCENARIOS = ROOT / "sil_plant" / "scenarios"

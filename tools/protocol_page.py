@@ -8,10 +8,10 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from sil_plant import e2e
+from sil_plant.bus import e2e
+from sil_plant.bus.protocol import BIT_RATE, SYNC_ID, database, frame_id, worst_case_bits
 from sil_plant.config import ROOT
-from sil_plant.machine import REFERENCE_ARM, load_machine
-from sil_plant.protocol import BIT_RATE, SYNC_ID, database, frame_id, worst_case_bits
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine
 
 PAGE = Path("docs/protocol.md")
 NODES = {"MASTER": "master", "ECU": "ECU", "IO": "I/O node"}
@@ -427,7 +427,7 @@ def _port_section() -> str:
 
 An angle is raw / 2^24 turns, a pressure raw * 0.005 bar, a spool raw / 16384: the node needs no floating point. To
 see it work: `python tools/doctor.py BUS`, then `python tools/monitor.py BUS`. The same node in Python, with the arm
-behind it, is [sil_plant/io_node.py](../sil_plant/io_node.py).
+behind it, is [sil_plant/loop/io_node.py](../sil_plant/loop/io_node.py).
 """
 
 

@@ -27,8 +27,8 @@ from sil_plant.environment import enter, say  # noqa: E402
 
 enter(__file__)
 
+from sil_plant.bus.protocol import database, worst_case_bus_load  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.protocol import database, worst_case_bus_load  # noqa: E402
 
 README = ROOT / "README.md"
 RUN = "sil_plant/run.py"

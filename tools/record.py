@@ -33,9 +33,9 @@ enter(__file__, mf4=True)
 from rich.console import Console  # noqa: E402
 from rich.progress import Progress, SpinnerColumn, TextColumn  # noqa: E402
 
-from sil_plant.buses import BusError, PythonCanPort, connect_python_can, parse_bus  # noqa: E402
+from sil_plant.bus.ports import BusError, PythonCanPort, connect_python_can, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.recorder import Recorder, convert_spool  # noqa: E402
+from sil_plant.recordings.recorder import Recorder, convert_spool  # noqa: E402
 
 EXIT_FAILED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 WAIT_S = 0.2  # the longest look at the bus: Ctrl-C takes effect after it

@@ -29,14 +29,14 @@ enter(__file__, mf4=True)
 import can  # noqa: E402
 import numpy as np  # noqa: E402
 
-from sil_plant.capture import capture  # noqa: E402
+from sil_plant.bus.frames import FRAME_BYTES  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.execution import PERIOD_US  # noqa: E402
-from sil_plant.frames import FRAME_BYTES  # noqa: E402
-from sil_plant.inproc import InprocEcu  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
-from sil_plant.session import NMT_RESET, make_session, nmt_frame  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
+from sil_plant.loop.execution import PERIOD_US  # noqa: E402
+from sil_plant.loop.inproc import InprocEcu  # noqa: E402
+from sil_plant.loop.session import NMT_RESET, make_session, nmt_frame  # noqa: E402
+from sil_plant.recordings.capture import capture  # noqa: E402
 
 REFERENCE = ROOT / "tests" / "sil" / "data" / "reference.log.gz"
 SCALAR = "fixed"

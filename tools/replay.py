@@ -30,13 +30,13 @@ enter(__file__, mf4=True)
 from rich.console import Console  # noqa: E402
 from rich.progress import BarColumn, Progress, TextColumn  # noqa: E402
 
-from sil_plant.commissioning import load_commissioned  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.inproc import SCALARS  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine, parameter_image, with_changes  # noqa: E402
-from sil_plant.recording import Recording, read_recording  # noqa: E402
-from sil_plant.replay import Replay, load_ecu_image, replay  # noqa: E402
-from sil_plant.scenario import PROFILE_NAMES, load_profile  # noqa: E402
+from sil_plant.experiments.commissioning import load_commissioned  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, parameter_image, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import PROFILE_NAMES, load_profile  # noqa: E402
+from sil_plant.loop.inproc import SCALARS  # noqa: E402
+from sil_plant.recordings.recording import Recording, read_recording  # noqa: E402
+from sil_plant.recordings.replay import Replay, load_ecu_image, replay  # noqa: E402
 
 EXIT_DIFFERENT, EXIT_UNUSABLE, EXIT_INTERRUPTED = 1, 2, 130
 

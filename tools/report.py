@@ -27,9 +27,9 @@ enter(__file__, mf4=True)
 from rich.console import Console  # noqa: E402
 
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.recording import read_recording  # noqa: E402
-from sil_plant.recording_report import POINTS_MOST, contents_of, page, part_of  # noqa: E402
-from sil_plant.results import check_writable  # noqa: E402
+from sil_plant.loop.results import check_writable  # noqa: E402
+from sil_plant.recordings.recording import read_recording  # noqa: E402
+from sil_plant.reports.recording_report import POINTS_MOST, contents_of, page, part_of  # noqa: E402
 
 EXIT_DAMAGED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 

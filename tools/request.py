@@ -26,13 +26,13 @@ from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
 
 enter(__file__)
 
-from sil_plant import session  # noqa: E402
-from sil_plant.buses import BusError  # noqa: E402
+from sil_plant.bus.ports import BusError  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.diagnosis import REFUSALS  # noqa: E402
-from sil_plant.listen import Listener, joinable  # noqa: E402
-from sil_plant.master import NETWORK, request_frames  # noqa: E402
-from sil_plant.watch import JOINTS, Snapshot, Watch  # noqa: E402
+from sil_plant.loop import session  # noqa: E402
+from sil_plant.monitoring.diagnosis import REFUSALS  # noqa: E402
+from sil_plant.monitoring.listen import Listener, joinable  # noqa: E402
+from sil_plant.monitoring.master import NETWORK, request_frames  # noqa: E402
+from sil_plant.monitoring.watch import JOINTS, Snapshot, Watch  # noqa: E402
 
 EXIT_REFUSED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 LOOK_S = 0.4  # every page of TIMING comes within it

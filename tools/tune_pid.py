@@ -24,9 +24,9 @@ enter(__file__)
 import numpy as np  # noqa: E402
 
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.experiment import Outcome, setup_for, simulate  # noqa: E402
-from sil_plant.machine import JOINT_NAMES, REFERENCE_ARM, Machine, load_machine, with_changes  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, Scenario, load_profile, load_scenario, with_load  # noqa: E402
+from sil_plant.experiments.experiment import Outcome, setup_for, simulate  # noqa: E402
+from sil_plant.inputs.machine import JOINT_NAMES, REFERENCE_ARM, Machine, load_machine, with_changes  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, Scenario, load_profile, load_scenario, with_load  # noqa: E402
 
 Gains = tuple[float, float, float]
 MARGIN = 2.0

@@ -188,7 +188,7 @@ Path(FOLDER / "seen.json").write_text(json.dumps(seen))
 @pytest.fixture(scope="module")
 def tour(run_on_vcan: Callable, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Run everything on vcan0, once."""
-    from sil_plant.machine import REFERENCE_ARM, load_machine, parameter_image
+    from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, parameter_image
     from tools import latency
 
     folder = tmp_path_factory.mktemp("linux_port")

@@ -7,8 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sil_plant.recording import read_recording
-from sil_plant.replay import replay
+from sil_plant.recordings.recording import read_recording
+from sil_plant.recordings.replay import replay
 
 ROOT = Path(__file__).resolve().parents[2]
 TICKS = 1101
@@ -46,7 +46,7 @@ seen["record"] = recorder.wait(60)
 sys.path.insert(0, str(ROOT))
 import can
 
-from sil_plant.buses import PythonCanPort, connect_python_can
+from sil_plant.bus.ports import PythonCanPort, connect_python_can
 
 with PythonCanPort(connect_python_can("vcan0"), "vcan0") as deaf, connect_python_can("vcan0") as sender:
     for number in range(20000):

@@ -24,12 +24,12 @@ from emulated_board import IMAGES, STAGES, BoardError, EmulatedBoard, Figures, I
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from sil_plant import execution, session  # noqa: E402
-from sil_plant.bus_run import EcuLostError, EcuMissingError  # noqa: E402
-from sil_plant.buses import BusError, parse_bus  # noqa: E402
+from sil_plant.bus.ports import BusError, parse_bus  # noqa: E402
 from sil_plant.config import ConfigError  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, load_machine  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_scenario, with_load  # noqa: E402
+from sil_plant.loop import execution, session  # noqa: E402
+from sil_plant.loop.bus_run import EcuLostError, EcuMissingError  # noqa: E402
 
 LOAD_KG, DURATION_S = 2.5, 10.0
 

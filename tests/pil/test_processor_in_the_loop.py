@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from emulated_board import IMAGES, ROOT, STAGES, BoardError, EmulatedBoard, Image, build
 
-from sil_plant import execution, protocol, session
-from sil_plant.buses import connect_python_can, parse_bus
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image
-from sil_plant.scenario import DEFAULT_SCENARIO, load_scenario, with_load
+from sil_plant.bus import protocol
+from sil_plant.bus.ports import connect_python_can, parse_bus
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, load_scenario, with_load
+from sil_plant.loop import execution, session
 
 PERIOD_S = execution.PERIOD_US * 1e-6
 # One whole run and the first moves of the others: an emulated tick takes 1.5 ms or more.

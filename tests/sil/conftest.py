@@ -21,9 +21,11 @@ if ROOT not in sys.path:
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from sil_plant import experiment, frames, inproc, protocol, results, session  # noqa: E402
-from sil_plant.machine import REFERENCE_ARM, Machine, load_machine, parameter_image  # noqa: E402
-from sil_plant.scenario import DEFAULT_SCENARIO, Scenario, load_scenario, with_load  # noqa: E402
+from sil_plant.bus import frames, protocol  # noqa: E402
+from sil_plant.experiments import experiment  # noqa: E402
+from sil_plant.inputs.machine import REFERENCE_ARM, Machine, load_machine, parameter_image  # noqa: E402
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, Scenario, load_scenario, with_load  # noqa: E402
+from sil_plant.loop import inproc, results, session  # noqa: E402
 from tests.sil.bounded import run_bounded  # noqa: E402
 
 RUN_PY = ROOT_PATH / "sil_plant" / "run.py"

@@ -17,8 +17,9 @@ from typing import Any
 import can
 import pytest
 
-from sil_plant import buses
-from sil_plant.buses import (
+from sil_plant.bus import ports
+from sil_plant.bus.hub import Hub
+from sil_plant.bus.ports import (
     BusAddress,
     BusError,
     FramePort,
@@ -30,7 +31,6 @@ from sil_plant.buses import (
     open_frame_port,
     parse_bus,
 )
-from sil_plant.hub import Hub
 
 LIMIT_S = 8.0  # no wait in this file is longer; reaching it is a failure
 ROOT = Path(__file__).resolve().parents[2]
@@ -257,7 +257,7 @@ def test_other_server_on_the_port_is_named_as_such() -> None:
 
 def test_server_that_says_nothing_does_not_hang_the_tool(monkeypatch: pytest.MonkeyPatch) -> None:
     """GIVEN a paused plant: its kernel accepts, but nobody greets WHEN a tool connects THEN it ends."""
-    monkeypatch.setattr(buses._probe_hub, "__defaults__", (0.05,))
+    monkeypatch.setattr(ports._probe_hub, "__defaults__", (0.05,))
     with socket.create_server(("127.0.0.1", 0)) as server, pytest.raises(BusError) as error:
         connect_python_can(f"tcp:127.0.0.1:{server.getsockname()[1]}")
     assert "does not greet" in one_line(error)
@@ -267,7 +267,7 @@ def test_tool_does_not_litter_the_terminal_with_split_frames() -> None:
     """GIVEN a plant in another process WHEN a tool reads frames that straddle python-can's 1024-byte reads
     THEN nothing is written to its terminal."""
     code = (
-        "import sys; from sil_plant.buses import connect_python_can\n"
+        "import sys; from sil_plant.bus.ports import connect_python_can\n"
         "with connect_python_can(sys.argv[1]) as bus:\n"
         "    bus.send(__import__('can').Message(arbitration_id=1, is_extended_id=False))\n"
         f"    assert all(bus.recv({LIMIT_S}) for _ in range(200))\n"
@@ -382,7 +382,7 @@ class FakeCanBus:
 @pytest.fixture
 def fake_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeCanBus]:
     bus = FakeCanBus()
-    monkeypatch.setattr(buses, "_open_socketcan", lambda address, **options: bus)
+    monkeypatch.setattr(ports, "_open_socketcan", lambda address, **options: bus)
     yield bus
     bus.socket.close()
     bus.far_end.close()

@@ -21,11 +21,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sil_plant import campaign_pool, campaign_results
-from sil_plant.campaign_results import ResultFolder, batches
-from sil_plant.campaign_run import code_hash, run_batch, warm_up
-from sil_plant.campaign_sampling import arms
-from sil_plant.campaign_spec import CAMPAIGNS, Campaign, load_campaign
+from sil_plant.campaigning import pool, results
+from sil_plant.campaigning.arm_run import code_hash, run_batch, warm_up
+from sil_plant.campaigning.results import ResultFolder, batches
+from sil_plant.campaigning.sampling import arms
+from sil_plant.campaigning.spec import CAMPAIGNS, Campaign, load_campaign
 from sil_plant.config import ROOT, ConfigError
 from tests.sil.campaign_specs import VARY_LOAD_AND_BORE
 
@@ -91,7 +91,7 @@ def campaign(spec: Path) -> Campaign:
 def truth(campaign: Campaign) -> pa.Table:
     """What every way of running the small spec has to give: one process, one arm after the other."""
     rows = run_batch(campaign.base, arms(campaign), code_hash())
-    return pa.Table.from_pylist(rows, campaign_results.schema(campaign))
+    return pa.Table.from_pylist(rows, results.schema(campaign))
 
 
 def argv(*arguments: object) -> list[str]:
@@ -141,7 +141,7 @@ def test_worker_that_dies_without_a_job_takes_the_others_work_with_it(monkeypatc
     """
     breaks = 1
 
-    class Pool(campaign_pool.ProcessPool):
+    class Pool(pool.ProcessPool):
         def schedule(self, *arguments, **options):
             nonlocal breaks
             if breaks == 0:
@@ -151,15 +151,15 @@ def test_worker_that_dies_without_a_job_takes_the_others_work_with_it(monkeypatc
             future.set_exception(BrokenProcessPool("All workers expired"))
             return future
 
-    monkeypatch.setattr(campaign_pool, "ProcessPool", Pool)
+    monkeypatch.setattr(pool, "ProcessPool", Pool)
     said: list[str] = []
     jobs = [(k, (k,)) for k in range(5)]
-    done = dict(campaign_pool.in_processes(math.factorial, jobs, 2, said.append, str))
+    done = dict(pool.in_processes(math.factorial, jobs, 2, said.append, str))
     assert done == {k: math.factorial(k) for k in range(5)}
     assert len(said) == 1 and "all are replaced" in said[0]
     breaks = 10**6
-    with pytest.raises(campaign_pool.WorkersLostError, match="die before they begin"):
-        dict(campaign_pool.in_processes(math.factorial, jobs, 2, said.append, str))
+    with pytest.raises(pool.WorkersLostError, match="die before they begin"):
+        dict(pool.in_processes(math.factorial, jobs, 2, said.append, str))
 
 
 def test_rows_differ_or_work_is_lost_after_a_kill(spec: Path, truth: pa.Table, tmp_path: Path, start) -> None:
@@ -246,19 +246,19 @@ def test_rows_of_a_cluster_differ_or_a_lost_scheduler_loses_work(
 def test_missing_scheduler_is_not_said(
     spec: Path, campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(campaign_pool, "CONNECT_S", 1.0)
+    monkeypatch.setattr(pool, "CONNECT_S", 1.0)
     address = f"tcp://127.0.0.1:{free_port()}"
     todo = batches(arms(campaign), 4)
     with pytest.raises(ConfigError, match="no scheduler answers there"):
-        next(campaign_pool.on_cluster(campaign.base, todo, code_hash(), address, print))
+        next(pool.on_cluster(campaign.base, todo, code_hash(), address, print))
     with pytest.raises(ConfigError, match="no scheduler answers there"):
-        next(campaign_pool.on_cluster(campaign.base, todo, code_hash(), "here:there", print))
+        next(pool.on_cluster(campaign.base, todo, code_hash(), "here:there", print))
 
 
 def test_batch_that_kills_its_workers_stops_the_campaign() -> None:
     said: list[str] = []
     jobs = [(n, (text,)) for n, text in enumerate(["1 + 1", "__import__('os')._exit(7)", "2 + 2"])]
-    done = dict(campaign_pool.in_processes(eval, jobs, 1, said.append, lambda n: f"runs {n}"))
+    done = dict(pool.in_processes(eval, jobs, 1, said.append, lambda n: f"runs {n}"))
     assert done == {0: 2, 1: None, 2: 4}
     assert len(said) == 2 and "with runs 1; it is replaced, they are computed again" in said[0]
     assert "exit status 7" in said[1] and "left out" in said[1]
@@ -268,7 +268,7 @@ def test_results_of_something_else_are_overwritten(campaign: Campaign, spec: Pat
     first = ResultFolder(tmp_path, campaign, "code")
     first.open(resume=False, fresh=False)
     batch = batches(arms(campaign), 2)[0]
-    rows = [dict.fromkeys(campaign_results.schema(campaign).names) | {"run": arm.run} for arm in batch.arms]
+    rows = [dict.fromkeys(results.schema(campaign).names) | {"run": arm.run} for arm in batch.arms]
     first.write(batch, rows)
     with pytest.raises(ConfigError, match="another campaign is writing there"):
         ResultFolder(tmp_path, campaign, "code").open(resume=True, fresh=False)
@@ -299,7 +299,7 @@ def test_full_disk_leaves_half_a_batch(campaign: Campaign, tmp_path: Path, monke
     folder.open(resume=False, fresh=False)
     one, two = batches(arms(campaign), 1)[:2]
 
-    def rows_of(batch: campaign_results.Batch) -> list[dict]:
+    def rows_of(batch: results.Batch) -> list[dict]:
         return [dict.fromkeys(folder.schema.names) | {"run": arm.run} for arm in batch.arms]
 
     folder.write(one, rows_of(one))
@@ -315,7 +315,7 @@ def test_full_disk_leaves_half_a_batch(campaign: Campaign, tmp_path: Path, monke
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(campaign_results.os, "fsync", no_room)
+        patch.setattr(results.os, "fsync", no_room)
         with pytest.raises(ConfigError, match="No space left on device; make room"):
             folder.write(two, rows_of(two))
     assert [path.name for path in (tmp_path / "shards").iterdir()] == ["000000.parquet"]
@@ -332,7 +332,7 @@ def test_arm_of_the_committed_campaign_fails() -> None:
 
 
 def test_worker_computes_with_other_code(campaign: Campaign) -> None:
-    from sil_plant.campaign_run import OtherCodeError
+    from sil_plant.campaigning.arm_run import OtherCodeError
 
     with pytest.raises(OtherCodeError):
         run_batch(campaign.base, arms(campaign)[:1], "0" * 64)

@@ -11,11 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from sil_plant import campaign_report as report
-from sil_plant import campaign_statistics as statistics
-from sil_plant.campaign_results import schema
-from sil_plant.campaign_sampling import arms
-from sil_plant.campaign_spec import Campaign, load_campaign
+from sil_plant.campaigning import statistics
+from sil_plant.campaigning.results import schema
+from sil_plant.campaigning.sampling import arms
+from sil_plant.campaigning.spec import Campaign, load_campaign
+from sil_plant.reports import campaign_report as report
 from tests.sil.campaign_specs import VARY_LOAD_AND_BORE
 
 SPEC = """name = "made up"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sil_plant.campaign_sampling import arms, check_arms, note, prepared
-from sil_plant.campaign_spec import CAMPAIGNS, load_campaign
+from sil_plant.campaigning.sampling import arms, check_arms, note, prepared
+from sil_plant.campaigning.spec import CAMPAIGNS, load_campaign
 from sil_plant.config import ROOT, ConfigError
-from sil_plant.experiment import setup_for
-from sil_plant.machine import REFERENCE_ARM, load_machine
+from sil_plant.experiments.experiment import setup_for
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine
 
 LOAD = '[[vary]]\nkey = "load_kg"\ndistribution = "uniform"\nlow = 0\nhigh = 10\n'
 

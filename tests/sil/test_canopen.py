@@ -21,11 +21,11 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 
-from sil_plant import protocol
-from sil_plant.buses import FramePort, connect_python_can, open_frame_port
-from sil_plant.hub import BusError
-from sil_plant.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image
-from sil_plant.objects import DATA_TYPES, EDS_PATH, load_objects
+from sil_plant.bus import protocol
+from sil_plant.bus.hub import BusError
+from sil_plant.bus.objects import DATA_TYPES, EDS_PATH, load_objects
+from sil_plant.bus.ports import FramePort, connect_python_can, open_frame_port
+from sil_plant.inputs.machine import REFERENCE_ARM, load_machine, load_parameter_table, parameter_image
 
 ROOT = Path(__file__).resolve().parents[2]
 ECU = ROOT / "firmware" / "diarc_ecu"

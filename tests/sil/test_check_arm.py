@@ -15,10 +15,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sil_plant import arm_statics, experiment, linear_loop, plant
-from sil_plant.machine import ARMS, BASE_KEYS, JOINT_NAMES, REFERENCE_ARM, Machine, load_machine
-from sil_plant.machine_proposal import propose
-from sil_plant.scenario import DEFAULT_SCENARIO, SCENARIOS, load_profile, load_scenario, with_load
+from sil_plant.design import linear_loop
+from sil_plant.design.proposal import propose
+from sil_plant.experiments import experiment
+from sil_plant.inputs.machine import ARMS, BASE_KEYS, JOINT_NAMES, REFERENCE_ARM, Machine, load_machine
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO, SCENARIOS, load_profile, load_scenario, with_load
+from sil_plant.plant import dynamics, statics
 from tools import check_arm
 
 REFERENCE_TEXT = REFERENCE_ARM.read_text(encoding="utf-8")
@@ -221,19 +223,19 @@ def test_opening_and_pressures_are_not_off_the_simulated_ones(load: float) -> No
     """
     machine = load_machine(REFERENCE_ARM)
     scenario = replace(load_scenario(DEFAULT_SCENARIO), duration_s=3.9)
-    motion = arm_statics.motion_of(scenario, 1e-3)
-    demand = arm_statics.demand(machine, motion, load)
+    motion = statics.motion_of(scenario, 1e-3)
+    demand = statics.demand(machine, motion, load)
     run = experiment.simulate(experiment.setup_for(machine, load_profile("paper"), with_load(scenario, load))).session
     start = run.timeline.motion
     time_s = (np.arange(len(run.record.state)) - start) * 1e-3
     for joint in range(2):
         wanted = np.interp(time_s[start:], motion.time_s, motion.q[:, joint])
         assert np.abs(run.record.reference[start:, joint] - wanted).max() < 5e-3  # told once in 10 ticks
-        spool = np.abs(run.record.state[start:, plant.XV + joint])
+        spool = np.abs(run.record.state[start:, dynamics.XV + joint])
         assert demand.opening[:, joint].max() == pytest.approx(spool.max(), rel=0.12)
         middle = (time_s > 0.5) & (time_s < 1.0)
         for side in range(2):
-            simulated = run.record.state[middle, plant.P_SWING + 2 * joint + side]
+            simulated = run.record.state[middle, dynamics.P_SWING + 2 * joint + side]
             worked_out = np.interp(time_s[middle], motion.time_s, demand.pressure[:, joint, side])
             assert np.abs(simulated - worked_out).max() < 4e5
 
@@ -241,11 +243,11 @@ def test_opening_and_pressures_are_not_off_the_simulated_ones(load: float) -> No
 def test_the_heaviest_load_is_what_the_plant_holds() -> None:
     """GIVEN the load said to be the heaviest WHEN the plant holds 1 % less and 1 % more THEN it can, and cannot."""
     machine = load_machine(REFERENCE_ARM)
-    heaviest, where = arm_statics.heaviest_held(machine)
-    parameters = plant.plant_parameters(machine)
-    plant.holding_pressures(parameters, np.array([0.0, where]), 0.99 * heaviest)
+    heaviest, where = statics.heaviest_held(machine)
+    parameters = dynamics.plant_parameters(machine)
+    dynamics.holding_pressures(parameters, np.array([0.0, where]), 0.99 * heaviest)
     with pytest.raises(ValueError, match="wrist cylinder cannot hold"):
-        plant.holding_pressures(parameters, np.array([0.0, where]), 1.01 * heaviest)
+        dynamics.holding_pressures(parameters, np.array([0.0, where]), 1.01 * heaviest)
 
 
 @pytest.mark.parametrize("joint", [0, 1])

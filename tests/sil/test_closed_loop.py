@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import execution, frames, inproc, protocol, results, session
-from sil_plant.machine import Machine
-from sil_plant.scenario import Scenario, with_load
+from sil_plant.bus import frames, protocol
+from sil_plant.inputs.machine import Machine
+from sil_plant.inputs.scenario import Scenario, with_load
+from sil_plant.loop import execution, inproc, results, session
 
 KEYS = (
     "load_true_kg load_est_kg load_err_kg load_settle_s peak_err_rad peak_err_after_1s_rad rms_err_rad rho_s "

@@ -12,13 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import commissioning, execution, experiment, session
+from sil_plant.bus.ecu_parameters import RefusedError
 from sil_plant.config import ConfigError
-from sil_plant.ecu_parameters import RefusedError
-from sil_plant.inproc import InprocEcu, run_inproc
-from sil_plant.machine import ARMS, REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes
-from sil_plant.results import run_of, summarise
-from sil_plant.scenario import (
+from sil_plant.experiments import commissioning, experiment
+from sil_plant.inputs.machine import ARMS, REFERENCE_ARM, Machine, load_machine, parameter_image, with_changes
+from sil_plant.inputs.scenario import (
     DEFAULT_SCENARIO,
     SCENARIOS,
     Scenario,
@@ -26,7 +24,10 @@ from sil_plant.scenario import (
     load_scenario,
     with_load,
 )
-from sil_plant.session import THETA
+from sil_plant.loop import execution, session
+from sil_plant.loop.inproc import InprocEcu, run_inproc
+from sil_plant.loop.results import run_of, summarise
+from sil_plant.loop.session import THETA
 
 ROOT = Path(__file__).resolve().parents[2]
 TUNING_SEED, RUN_SEED = 41, 7

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sil_plant import frames, inproc, protocol, session
-from sil_plant.buses import BusError
-from sil_plant.control import Control, Hello
-from sil_plant.live_plant import LIVE_SCENARIO, PlantLink
-from sil_plant.scenario import load_scenario, with_load
+from sil_plant.bus import frames, protocol
+from sil_plant.bus.ports import BusError
+from sil_plant.inputs.scenario import load_scenario, with_load
+from sil_plant.live.plant import LIVE_SCENARIO, PlantLink
+from sil_plant.loop import inproc, session
+from sil_plant.loop.control_channel import Control, Hello
 
 LIMIT_S = 10.0
 HEAVIEST_KG = 15.0

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import frames, inproc, protocol
-from sil_plant.machine import load_parameter_table, parameter_image
+from sil_plant.bus import frames, protocol
+from sil_plant.inputs.machine import load_parameter_table, parameter_image
+from sil_plant.loop import inproc
 
 ROOT = Path(__file__).resolve().parents[2]
 SCALES_H = ROOT / "can_protocol" / "generated" / "diarc_scales.h"

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import fault_matrix, session
 from sil_plant.config import ConfigError
-from sil_plant.fault_matrix import Cell, cells, judge, load_cases, measure, one_cell, run
-from sil_plant.faults import KINDS, Fault
-from sil_plant.scenario import Scenario, check_scenario, load_scenario
+from sil_plant.experiments import fault_matrix
+from sil_plant.experiments.fault_matrix import Cell, cells, judge, load_cases, measure, one_cell, run
+from sil_plant.inputs.faults import KINDS, Fault
+from sil_plant.inputs.scenario import Scenario, check_scenario, load_scenario
+from sil_plant.loop import session
 
 ROOT_PATH = Path(__file__).resolve().parents[2]
 LIMIT_S = 120.0

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from sil_plant import frames, protocol, session
-from sil_plant.buses import BusError, connect_python_can
-from sil_plant.hub import Hub
+from sil_plant.bus import frames, protocol
+from sil_plant.bus.hub import Hub
+from sil_plant.bus.ports import BusError, connect_python_can
+from sil_plant.loop import session
 
 LIMIT_S = 60.0
 SILENCE_LIMIT_S = 10.0

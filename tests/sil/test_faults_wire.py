@@ -10,11 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sil_plant import experiment, frames, inproc, protocol, session
-from sil_plant.faults import FRAMES, KINDS, SENSORS, Fault
-from sil_plant.injection import SUPPLY_SHARE, draw
-from sil_plant.machine import Machine
-from sil_plant.scenario import Scenario, load_profile
+from sil_plant.bus import frames, protocol
+from sil_plant.experiments import experiment
+from sil_plant.inputs.faults import FRAMES, KINDS, SENSORS, Fault
+from sil_plant.inputs.machine import Machine
+from sil_plant.inputs.scenario import Scenario, load_profile
+from sil_plant.loop import inproc, session
+from sil_plant.loop.injection import SUPPLY_SHARE, draw
 
 START_S, DURATION_S = 0.30, 0.05
 BEGIN, END = 400, 450  # ticks of the run: 0.1 s of standstill come first

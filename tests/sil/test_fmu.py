@@ -27,13 +27,15 @@ from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 from fmpy.validation import validate_fmu
 
-from sil_plant import ecu_fmu, inproc, plant, plant_fmu, session
 from sil_plant.config import ConfigError, tomllib
-from sil_plant.external_plant import ExternalPlant, PlantLostError
-from sil_plant.fmu_map import bind, load_map
-from sil_plant.machine import Machine, load_parameter_table, parameter_image, with_changes
-from sil_plant.plant_object import slots
-from sil_plant.scenario import Scenario, with_load
+from sil_plant.fmu import ecu_fmu, plant_fmu
+from sil_plant.fmu.plant_object import slots
+from sil_plant.inputs.machine import Machine, load_parameter_table, parameter_image, with_changes
+from sil_plant.inputs.scenario import Scenario, with_load
+from sil_plant.loop import inproc, session
+from sil_plant.loop.external_plant import ExternalPlant, PlantLostError
+from sil_plant.loop.fmu_map import bind, load_map
+from sil_plant.plant import dynamics
 
 ROOT = Path(__file__).resolve().parents[2]
 MAP = ROOT / "sil_plant" / "maps" / "diarc_plant.toml"
@@ -237,9 +239,9 @@ def test_no_parameter_of_the_plant_is_forgotten(machine: Machine) -> None:
     """GIVEN the plant's parameters WHEN compared with the FMU's THEN each is offered, or follows from the geometry."""
     fixed = {"crank_a2_b2", "crank_ab", "q0", "x_offset", "stroke", "lever_inverse", "q_low", "q_high"}
     fixed |= {"friction_at_cylinder"}
-    fields = set(plant.plant_parameters(machine)._fields)
-    assert fields == fixed | set(plant_fmu.PARAMETER_VARIABLES), "describe the new one in sil_plant/plant_fmu.py"
-    assert len(slots(plant.plant_parameters(machine))["kv"]) == 2
+    fields = set(dynamics.plant_parameters(machine)._fields)
+    assert fields == fixed | set(plant_fmu.PARAMETER_VARIABLES), "describe the new one in sil_plant/fmu/plant_fmu.py"
+    assert len(slots(dynamics.plant_parameters(machine))["kv"]) == 2
 
 
 @pytest.mark.parametrize("version", plant_fmu.VERSIONS)
@@ -247,8 +249,10 @@ def test_parameter_of_the_plant_is_not_ignored(plants: dict[str, Path], version:
     """GIVEN another load, pose and supply WHEN initialised THEN the arm rests there with the pressures of the model."""
     opened = slave(plants[version]).set(load=4.0, swing_angle_start=0.3, wrist_angle_start=-0.2, p_supply=150e5)
     opened.start()
-    expected = plant.state_at_rest(
-        plant.plant_parameters(with_changes(machine, {"supply.pressure_Pa": 150e5}, "test")), np.array([0.3, -0.2]), 4.0
+    expected = dynamics.state_at_rest(
+        dynamics.plant_parameters(with_changes(machine, {"supply.pressure_Pa": 150e5}, "test")),
+        np.array([0.3, -0.2]),
+        4.0,
     )
     found = opened.get(*(name for name, _, _ in plant_fmu.STATE_VARIABLES))
     assert found == expected.tolist()
@@ -384,7 +388,7 @@ def test_valve_lag_of_the_map_does_not_go_missing(
     lag_s = 0.004
     bare = edited(tmp_path, *BARE, ("[parameters]", f"[valve]\nlag_s = {lag_s}\n[parameters]"))
     run, _ = run_external(machine, paper, plants["2.0"], bare)
-    command, spool = run.record.command, run.record.state[:, plant.XV : plant.XV + 2]
+    command, spool = run.record.command, run.record.state[:, dynamics.XV : dynamics.XV + 2]
     expected, value, u = np.zeros_like(spool), np.zeros(2), np.zeros(2)
     for tick in range(1, len(spool)):
         for duration, now in ((DELAY_S, u), (PERIOD_S - DELAY_S, command[tick])):
@@ -415,7 +419,7 @@ def test_fixed_step_of_an_fmu_is_not_ignored(
     assert np.array_equal(run.record.state, expected.state)
     finer = rewritten(plants["2.0"], "quarter.fmu", fixed, ('stepSize="0.001"', 'stepSize="0.00025"'))
     run, _ = run_external(machine, paper, finer, MAP, 0.5)
-    apart = np.abs(run.record.state - expected.state)[:, plant.Q : plant.W].max()
+    apart = np.abs(run.record.state - expected.state)[:, dynamics.Q : dynamics.W].max()
     assert 0.0 < apart < 2e-6  # the plant's own steps end where the FMU's do
     bad = rewritten(plants["2.0"], "third.fmu", fixed, ('stepSize="0.001"', 'stepSize="0.0003"'))
     with pytest.raises(ConfigError, match=r"third\.fmu: takes steps of 0\.0003 s only.*io\.command_delay_s"):
@@ -546,8 +550,8 @@ def test_fmu_in_other_units_does_not_drive_another_way(
     assert np.array_equal(run.record.state, native(0.5).record.state)
     shifted = edited(tmp_path, ('"swing_bore_pressure"', '{ variable = "swing_bore_pressure", offset = 3e5 }'))
     off, _ = run_external(machine, paper, plants["2.0"], shifted, 0.05)
-    same = native(0.5).record.state[0, plant.P_SWING]
-    assert off.record.state[0, plant.P_SWING] == pytest.approx(same + 3e5)
+    same = native(0.5).record.state[0, dynamics.P_SWING]
+    assert off.record.state[0, dynamics.P_SWING] == pytest.approx(same + 3e5)
 
 
 def test_fmu_that_cannot_be_used_is_not_tried(plants: dict[str, Path], rewritten, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from sil_plant import frames, protocol
+from sil_plant.bus import frames, protocol
 
 e2e_p01 = pytest.importorskip("e2e.p01", reason="autosar-e2e comes for x86-64 only")
 

@@ -13,9 +13,9 @@ from types import ModuleType
 
 import pytest
 
-from sil_plant import protocol
+from sil_plant.bus import protocol
 from sil_plant.config import tomllib
-from sil_plant.machine import load_parameter_table
+from sil_plant.inputs.machine import load_parameter_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATE = re.compile(r"\b(19|20)\d\d\b.*\d\d:\d\d|\d\d:\d\d:\d\d|\b(19|20)\d\d-\d\d-\d\d\b")

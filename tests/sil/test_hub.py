@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from sil_plant import hub as hub_module
-from sil_plant.hub import EXTENDED_ID, BusError, Hub
+from sil_plant.bus import hub as hub_module
+from sil_plant.bus.hub import EXTENDED_ID, BusError, Hub
 
 LIMIT_S = 8.0  # no wait in this file is longer; reaching it is a failure
 

@@ -7,9 +7,11 @@ import copy
 import numpy as np
 import pytest
 
-from sil_plant import frames, io_node, plant, protocol
-from sil_plant.io_node import E2E_REFUSED, SYNC_LOST, TICK, TIMED_OUT, Node, NodeTiming
-from sil_plant.machine import Machine, with_changes
+from sil_plant.bus import frames, protocol
+from sil_plant.inputs.machine import Machine, with_changes
+from sil_plant.loop import io_node
+from sil_plant.loop.io_node import E2E_REFUSED, SYNC_LOST, TICK, TIMED_OUT, Node, NodeTiming
+from sil_plant.plant import dynamics
 
 PERIOD_S = 1e-3
 LOAD_KG = 3.0
@@ -20,11 +22,11 @@ class Rig:
 
     def __init__(self, machine: Machine, **changes: float) -> None:
         machine = with_changes(machine, {f"io.{key}": value for key, value in changes.items()}, "test")
-        self.plant = plant.plant_parameters(machine)
+        self.plant = dynamics.plant_parameters(machine)
         self.layout = io_node.node_layout()
         self.timing: NodeTiming = io_node.node_timing(machine, PERIOD_S)
         self.errors = io_node.node_errors(machine)
-        y = plant.state_at_rest(self.plant, np.array([0.1, 0.2]), LOAD_KG)
+        y = dynamics.state_at_rest(self.plant, np.array([0.1, 0.2]), LOAD_KG)
         self.node: Node = io_node.make_node(y, LOAD_KG)
         self.counter = 0
         self.out = np.zeros((3, frames.FRAME_BYTES), dtype=np.uint8)
@@ -69,9 +71,9 @@ class Rig:
 
     def advance(self, *parts: tuple[tuple[float, float], float]) -> np.ndarray:
         """The plant's present state, moved on by (spools, seconds) each, in a copy."""
-        y, work = self.node.y.copy(), np.zeros((5, plant.STATES))
+        y, work = self.node.y.copy(), np.zeros((5, dynamics.STATES))
         for u, seconds in parts:
-            plant.integrate(y, np.array(u), self.node.load[0], self.plant, seconds, work)
+            dynamics.integrate(y, np.array(u), self.node.load[0], self.plant, seconds, work)
         return y
 
 
@@ -248,7 +250,7 @@ def test_valves_do_not_stay_open_without_commands(machine: Machine, timeout_s: f
         open_ticks += bool(rig.node.u[0].any())
     assert open_ticks in (limit - 1, limit)
     assert rig.node.count[TIMED_OUT] == 1
-    assert np.abs(rig.node.y[plant.XV : plant.XV + 2]).max() < 1e-3  # the spools did centre
+    assert np.abs(rig.node.y[dynamics.XV : dynamics.XV + 2]).max() < 1e-3  # the spools did centre
     rig.send(rig.command(limit + 19, 4096, 0))
     rig.sync(limit + 20)
     assert rig.node.u[0].tolist() == [0.25, 0.0]
@@ -311,13 +313,13 @@ def test_missing_sync_does_not_stop_time(machine: Machine, counters, ticks: int,
     THEN the plant moves on by every tick; gaps are counted.
     """
     rig = Rig(machine)
-    rig.node.y[plant.W] = 0.2  # something that moves on its own
+    rig.node.y[dynamics.W] = 0.2  # something that moves on its own
     reference = rig.node.y.copy()
     for counter in counters:
         rig.sync(counter)
-    work = np.zeros((5, plant.STATES))
+    work = np.zeros((5, dynamics.STATES))
     for _ in range(2 * ticks):
-        plant.integrate(reference, np.zeros(2), LOAD_KG, rig.plant, PERIOD_S / 2, work)
+        dynamics.integrate(reference, np.zeros(2), LOAD_KG, rig.plant, PERIOD_S / 2, work)
     assert np.array_equal(rig.node.y, reference)
     assert rig.node.count[TICK] == ticks and rig.node.count[SYNC_LOST] == lost
 
@@ -330,7 +332,7 @@ def test_gap_in_sync_does_not_keep_the_valves_open(rig: Rig) -> None:
     rig.sync(2)
     rig.sync(52)
     assert rig.node.u[0].tolist() == [0.0, 0.0] and rig.node.count[SYNC_LOST] == 49
-    assert np.abs(rig.node.y[plant.XV : plant.XV + 2]).max() < 1e-3
+    assert np.abs(rig.node.y[dynamics.XV : dynamics.XV + 2]).max() < 1e-3
 
 
 # ---- sensors --------------------------------------------------------------------------------------

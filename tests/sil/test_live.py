@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sil_plant import hub
-from sil_plant.arm_geometry import ball_radius_m, geometry
-from sil_plant.buses import parse_bus
+from sil_plant.bus import hub
+from sil_plant.bus.ports import parse_bus
 from sil_plant.config import ConfigError
-from sil_plant.control import Request
-from sil_plant.faults import KINDS, read_fault
-from sil_plant.listen import Listener
-from sil_plant.plant import plant_parameters
-from sil_plant.watch import Watch
+from sil_plant.inputs.faults import KINDS, read_fault
+from sil_plant.loop.control_channel import Request
+from sil_plant.monitoring.listen import Listener
+from sil_plant.monitoring.watch import Watch
+from sil_plant.plant.dynamics import plant_parameters
+from sil_plant.plant.geometry import ball_radius_m, geometry
 
 ROOT = Path(__file__).resolve().parents[2]
 LIVE = ROOT / "tools" / "live.py"
@@ -235,10 +235,10 @@ def running() -> Iterator[tuple[subprocess.Popen, int]]:
 @pytest.mark.timeout(240)
 def test_the_page_opens_the_arm_moves_and_the_estimate_is_the_one_on_the_bus(running):
     pytest.importorskip("playwright", reason="PyPI playwright is not here: make setup")
-    from sil_plant import live_picture
+    from sil_plant.live import picture
 
     try:
-        live_picture.chromium()
+        picture.chromium()
     except ConfigError as error:
         pytest.skip(str(error))
     process, port = running
@@ -247,13 +247,13 @@ def test_the_page_opens_the_arm_moves_and_the_estimate_is_the_one_on_the_bus(run
     bus = re.search(r"tcp:127\.0\.0\.1:\d+", first).group()
     ears = Ears(bus)
     try:
-        with live_picture.browser_page(1000, 640) as page:
+        with picture.browser_page(1000, 640) as page:
             frames, outside = [], []
             page.on("websocket", lambda socket_: socket_.on("framereceived", lambda data: frames.append(len(data))))
             page.on("request", lambda request: None if "//127.0.0.1:" in request.url else outside.append(request.url))
             page.on("pageerror", lambda error: outside.append(f"error: {error}"))
             page.goto(f"http://127.0.0.1:{port}", timeout=LIMIT_S * 1e3)
-            live_picture.wait_for_estimate(page, int(COMPILE_LIMIT_S * 1e3))
+            picture.wait_for_estimate(page, int(COMPILE_LIMIT_S * 1e3))
 
             def text(mark: str) -> str:
                 return page.evaluate(f"document.querySelector('[data-diarc=\"{mark}\"]').textContent")

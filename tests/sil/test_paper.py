@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import paper_figures
-from sil_plant import paper_report as report
-from sil_plant.paper_report import Bar, Report
-from sil_plant.results import Result
-from sil_plant.scenario import load_profile, load_scenario
+from sil_plant.inputs.scenario import load_profile, load_scenario
+from sil_plant.loop.results import Result
+from sil_plant.reports import paper_figures
+from sil_plant.reports import paper_report as report
+from sil_plant.reports.paper_report import Bar, Report
 from tools import paper
 
 VOID = {"meta", "br", "img", "link", "hr", "input"}

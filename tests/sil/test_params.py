@@ -16,10 +16,10 @@ from pathlib import Path
 import canopen
 import pytest
 
-from sil_plant.buses import connect_python_can
-from sil_plant.hub import Hub
-from sil_plant.machine import ARMS, REFERENCE_ARM, load_machine, load_parameter_table, parameter_image
-from sil_plant.objects import FIRST_PARAMETER
+from sil_plant.bus.hub import Hub
+from sil_plant.bus.objects import FIRST_PARAMETER
+from sil_plant.bus.ports import connect_python_can
+from sil_plant.inputs.machine import ARMS, REFERENCE_ARM, load_machine, load_parameter_table, parameter_image
 
 ROOT = Path(__file__).resolve().parents[2]
 ECU_BINARY = ROOT / "firmware" / "diarc_ecu"

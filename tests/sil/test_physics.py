@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import simpson
 
-from sil_plant.machine import JOINT_NAMES, REFERENCE_ARM, Machine, load_machine
-from sil_plant.plant import (
+from sil_plant.inputs.machine import JOINT_NAMES, REFERENCE_ARM, Machine, load_machine
+from sil_plant.plant.dynamics import (
     LONGEST_STEP_S,
     P_SWING,
     STATES,

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sil_plant import plant, session
-from sil_plant.machine import Machine, with_changes
-from sil_plant.plant import PlantParameters
+from sil_plant.inputs.machine import Machine, with_changes
+from sil_plant.loop import session
+from sil_plant.plant import dynamics
+from sil_plant.plant.dynamics import PlantParameters
 
 CLOSED = np.zeros(2)
 TICK_S = 1e-3
@@ -21,24 +22,24 @@ SCALE = np.array([1, 1, 1, 1, 1e6, 1e6, 1e6, 1e6, 1, 1, 1e2, 1e2])
 
 @pytest.fixture(scope="module")
 def arm(machine: Machine) -> PlantParameters:
-    return plant.plant_parameters(machine)
+    return dynamics.plant_parameters(machine)
 
 
 @pytest.fixture(scope="module")
 def tight(machine: Machine) -> PlantParameters:
     """The arm with cylinders that do not leak."""
     changes = {f"{joint}.leakage_m3_s_Pa": 0.0 for joint in ("swing", "wrist")}
-    return plant.plant_parameters(with_changes(machine, changes, "test"))
+    return dynamics.plant_parameters(with_changes(machine, changes, "test"))
 
 
 def scratch() -> np.ndarray:
-    return np.zeros((5, plant.STATES))
+    return np.zeros((5, dynamics.STATES))
 
 
 def rhs(u: np.ndarray, load: float, arm: PlantParameters):
     def f(_: float, y: np.ndarray) -> np.ndarray:
-        dy = np.empty(plant.STATES)
-        plant.derivative(y, u, load, arm, dy)
+        dy = np.empty(dynamics.STATES)
+        dynamics.derivative(y, u, load, arm, dy)
         return dy
 
     return f
@@ -64,7 +65,7 @@ def test_integrator_is_not_off_by_more_than_a_microradian(simulate, arm: PlantPa
     for k in range(ticks - 1):
         # the command recorded at a SYNC is in effect up to the delay, the next one from there on
         for u in (record.command[k], record.command[k + 1]):
-            plant.integrate(ours, u, 3.0, arm, TICK_S / 2, work)
+            dynamics.integrate(ours, u, 3.0, arm, TICK_S / 2, work)
             f = rhs(u, 3.0, arm)
             solution = solve_ivp(f, (0, TICK_S / 2), exact, method="LSODA", rtol=1e-10, atol=1e-12 * SCALE)
             assert solution.success
@@ -80,16 +81,16 @@ def test_integrator_has_not_lost_its_order(arm: PlantParameters) -> None:
     THEN angles, rates and pressures are 16 times as exact.
     """
     u, load, duration = np.array([0.15, 0.12]), 3.0, 0.02
-    start = plant.state_at_rest(arm, np.zeros(2), load)
-    plant.integrate(start, u, load, arm, 0.2, scratch())
+    start = dynamics.state_at_rest(arm, np.zeros(2), load)
+    dynamics.integrate(start, u, load, arm, 0.2, scratch())
     assert (start[2:4] > 0.2).all()  # far from the bend of the friction
     exact = solve_ivp(rhs(u, load, arm), (0, duration), start, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
     errors = []
     for steps in (80, 160, 320):
-        assert duration / steps <= plant.LONGEST_STEP_S
+        assert duration / steps <= dynamics.LONGEST_STEP_S
         y, work = start.copy(), scratch()
         for _ in range(steps):
-            plant.integrate(y, u, load, arm, duration / steps, work)
+            dynamics.integrate(y, u, load, arm, duration / steps, work)
         difference = np.abs(y - exact)
         errors.append([difference[0:2].max(), difference[2:4].max(), difference[4:8].max()])
     orders = np.log2(np.array(errors)[:-1] / np.array(errors)[1:])
@@ -100,21 +101,21 @@ def test_a_long_stretch_is_not_one_long_step(arm: PlantParameters) -> None:
     """GIVEN durations up to 0.1 s WHEN integrated at once THEN it is many steps of at most the longest."""
     u = np.array([0.3, -0.2])
     for duration, steps in ((0.1, 200), (5.1e-4, 2), (5e-4, 1), (2e-3, 4), (1e-3, 2), (1e-6, 1)):
-        once = plant.state_at_rest(arm, np.zeros(2), 5.0)
+        once = dynamics.state_at_rest(arm, np.zeros(2), 5.0)
         many = once.copy()
-        plant.integrate(once, u, 5.0, arm, duration, scratch())
+        dynamics.integrate(once, u, 5.0, arm, duration, scratch())
         for _ in range(steps):
-            plant.integrate(many, u, 5.0, arm, duration / steps, scratch())
+            dynamics.integrate(many, u, 5.0, arm, duration / steps, scratch())
         assert np.allclose(once, many, rtol=1e-12, atol=1e-12) and not np.array_equal(
-            once, plant.state_at_rest(arm, np.zeros(2), 5.0)
+            once, dynamics.state_at_rest(arm, np.zeros(2), 5.0)
         )
 
 
 def test_no_time_does_not_move_the_plant(arm: PlantParameters) -> None:
     """GIVEN a delay of zero WHEN integrated over THEN nothing changes."""
-    y = plant.state_at_rest(arm, np.zeros(2), 5.0)
+    y = dynamics.state_at_rest(arm, np.zeros(2), 5.0)
     before = y.copy()
-    plant.integrate(y, np.ones(2), 5.0, arm, 0.0, scratch())
+    dynamics.integrate(y, np.ones(2), 5.0, arm, 0.0, scratch())
     assert np.array_equal(y, before)
 
 
@@ -124,11 +125,11 @@ def test_energy_does_not_come_from_nowhere(machine: Machine) -> None:
     """
     changes = {f"{joint}.{key}": 0.0 for joint in ("swing", "wrist") for key in ("viscous_Nms_rad", "coulomb_Nm")}
     changes |= {f"{joint}.leakage_m3_s_Pa": 0.0 for joint in ("swing", "wrist")}
-    arm = plant.plant_parameters(with_changes(machine, changes, "test"))
+    arm = dynamics.plant_parameters(with_changes(machine, changes, "test"))
     # pressures that push no piston, and nearly no oil stiffness: what is left is the links
     arm = arm._replace(bulk_modulus=1e-3, kv=np.zeros(2), q_low=np.full(2, -9.0), q_high=np.full(2, 9.0))
     load = 4.0
-    y = np.zeros(plant.STATES)
+    y = np.zeros(dynamics.STATES)
     y[:4] = 0.1, 0.3, 1.5, -1.0
     y[4:8] = 1e6, 1e6 * arm.area1[0] / arm.area2[0], 1e6, 1e6 * arm.area1[1] / arm.area2[1]
 
@@ -146,7 +147,7 @@ def test_energy_does_not_come_from_nowhere(machine: Machine) -> None:
 
     start = energy(y)
     for _ in range(300):
-        plant.integrate(y, CLOSED, load, arm, TICK_S, scratch())
+        dynamics.integrate(y, CLOSED, load, arm, TICK_S, scratch())
         assert energy(y) == pytest.approx(start, rel=1e-6)
     assert abs(y[2] - 1.5) > 0.05 and abs(y[3] + 1.0) > 0.5  # it did swing
 
@@ -161,12 +162,12 @@ def test_arm_at_rest_does_not_move(arm: PlantParameters, tight: PlantParameters,
     THEN a tight arm stays; a leaking one only creeps.
     """
     for parameters, drift in ((tight, 1e-12), (arm, 0.03)):
-        y = plant.state_at_rest(parameters, np.array(pose), load)
-        dy = np.empty(plant.STATES)
-        plant.derivative(y, CLOSED, load, parameters, dy)
+        y = dynamics.state_at_rest(parameters, np.array(pose), load)
+        dy = np.empty(dynamics.STATES)
+        dynamics.derivative(y, CLOSED, load, parameters, dy)
         assert np.abs(dy[:4]).max() < 1e-12
         start = y.copy()
-        plant.integrate(y, CLOSED, load, parameters, 1.0, scratch())
+        dynamics.integrate(y, CLOSED, load, parameters, 1.0, scratch())
         assert np.abs(y[:2] - start[:2]).max() < drift
     assert np.abs(y[:2] - start[:2]).max() > 1e-4  # the leakage is there
 
@@ -178,7 +179,7 @@ def test_holding_pressures_do_not_miss_the_load(arm: PlantParameters, pose, load
     THEN force times lever, by differences, is the weight's torque.
     """
     q = np.array(pose)
-    pressures = plant.holding_pressures(arm, q, load)
+    pressures = dynamics.holding_pressures(arm, q, load)
     force = pressures[:, 0] * arm.area1 - pressures[:, 1] * arm.area2
     lever = (piston(q + 1e-6, arm) - piston(q - 1e-6, arm)) / 2e-6
     weight = arm.g * arm.L2 * math.cos(q[1]) * (arm.m2 / 2 + load)
@@ -189,7 +190,7 @@ def test_holding_pressures_do_not_miss_the_load(arm: PlantParameters, pose, load
 def test_load_that_cannot_be_held_is_not_started_with(arm: PlantParameters) -> None:
     """GIVEN 1000 kg WHEN pressures are asked for THEN ValueError names the wrist and the load."""
     with pytest.raises(ValueError, match=r"wrist.*1000 kg"):
-        plant.holding_pressures(arm, np.zeros(2), 1000.0)
+        dynamics.holding_pressures(arm, np.zeros(2), 1000.0)
 
 
 @pytest.mark.parametrize("spool", [0.05, -0.05, 1.0])
@@ -197,11 +198,11 @@ def test_steady_speed_is_not_other_than_the_valve_gives(tight: PlantParameters, 
     """GIVEN a constant spool WHEN the swing joint moves evenly
     THEN both chambers' flows are kv u sqrt(dp).
     """
-    y = plant.state_at_rest(tight, np.array([0.3, 0.0]), 0.0)
-    plant.integrate(y, np.array([spool, 0.0]), 0.0, tight, 0.15 if abs(spool) < 1 else 0.05, scratch())
-    dy = np.empty(plant.STATES)
-    plant.derivative(y, np.array([spool, 0.0]), 0.0, tight, dy)
-    q, w, xv = y[0], y[2], y[plant.XV]
+    y = dynamics.state_at_rest(tight, np.array([0.3, 0.0]), 0.0)
+    dynamics.integrate(y, np.array([spool, 0.0]), 0.0, tight, 0.15 if abs(spool) < 1 else 0.05, scratch())
+    dy = np.empty(dynamics.STATES)
+    dynamics.derivative(y, np.array([spool, 0.0]), 0.0, tight, dy)
+    q, w, xv = y[0], y[2], y[dynamics.XV]
     lever = float((piston(y[:2] + 1e-6, tight) - piston(y[:2] - 1e-6, tight))[0] / 2e-6)
     x = float(piston(y[:2], tight)[0])
     supply, tank = tight.p_supply, tight.p_tank
@@ -230,13 +231,13 @@ def test_joint_does_not_leave_its_range(arm: PlantParameters, joint: int, spool:
     """
     u = np.zeros(2)
     u[joint] = spool
-    y, work, deepest = plant.state_at_rest(arm, np.zeros(2), 3.0), scratch(), 0.0
+    y, work, deepest = dynamics.state_at_rest(arm, np.zeros(2), 3.0), scratch(), 0.0
 
     def beyond() -> float:
         return float(max(arm.q_low[joint] - y[joint], y[joint] - arm.q_high[joint]))
 
     for _ in range(round(3.0 / min(abs(spool), 0.3)) * 20):
-        plant.integrate(y, u, 3.0, arm, 0.05, work)
+        dynamics.integrate(y, u, 3.0, arm, 0.05, work)
         deepest = max(deepest, beyond())
     assert 0.0 < beyond() < 0.02
     assert deepest < 0.05
@@ -248,9 +249,9 @@ def test_state_does_not_run_away_with_full_valves(arm: PlantParameters, spools) 
     """GIVEN both valves fully open for 5 s WHEN integrated
     THEN all is finite, no chamber below vacuum, nothing spins.
     """
-    y, work = plant.state_at_rest(arm, np.zeros(2), 10.0), scratch()
+    y, work = dynamics.state_at_rest(arm, np.zeros(2), 10.0), scratch()
     for _ in range(500):
-        plant.integrate(y, np.array(spools), 10.0, arm, 0.01, work)
+        dynamics.integrate(y, np.array(spools), 10.0, arm, 0.01, work)
         assert np.isfinite(y).all() and (y[4:8] >= 0.0).all() and (y[4:8] < 1e8).all()
         assert (np.abs(y[:2]) < math.pi).all() and (np.abs(y[2:4]) < 50.0).all()
         assert (np.abs(y[8:10]) < 1.2).all()

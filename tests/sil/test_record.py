@@ -14,12 +14,12 @@ from pathlib import Path
 import can
 import pytest
 
-from sil_plant import protocol
-from sil_plant.buses import HubPort
-from sil_plant.hub import Hub
-from sil_plant.recorder import Recorder, RecorderError, convert_spool
-from sil_plant.recording import FORMATS, RecordingError, read_recording, spool_of
-from sil_plant.replay import replay
+from sil_plant.bus import protocol
+from sil_plant.bus.hub import Hub
+from sil_plant.bus.ports import HubPort
+from sil_plant.recordings.recorder import Recorder, RecorderError, convert_spool
+from sil_plant.recordings.recording import FORMATS, RecordingError, read_recording, spool_of
+from sil_plant.recordings.replay import replay
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORD_PY = ROOT / "tools" / "record.py"

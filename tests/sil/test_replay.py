@@ -16,12 +16,14 @@ import can
 import numpy as np
 import pytest
 
-from sil_plant import protocol, session
-from sil_plant.capture import capture
-from sil_plant.frames import DATA, from_row, protect, to_row
-from sil_plant.inproc import InprocEcu
-from sil_plant.machine import Machine, load_parameter_table, parameter_image
-from sil_plant.recording import (
+from sil_plant.bus import protocol
+from sil_plant.bus.frames import DATA, from_row, protect, to_row
+from sil_plant.inputs.machine import Machine, load_parameter_table, parameter_image
+from sil_plant.inputs.scenario import Scenario
+from sil_plant.loop import session
+from sil_plant.loop.inproc import InprocEcu
+from sil_plant.recordings.capture import capture
+from sil_plant.recordings.recording import (
     ECU_NODE,
     FORMATS,
     Recording,
@@ -32,8 +34,7 @@ from sil_plant.recording import (
     rows_of,
     signal,
 )
-from sil_plant.replay import SDO_ANSWER_ID, replay
-from sil_plant.scenario import Scenario
+from sil_plant.recordings.replay import SDO_ANSWER_ID, replay
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "sil" / "data" / "reference.log.gz"

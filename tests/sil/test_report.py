@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import protocol
-from sil_plant.recording import Recording, read_recording
-from sil_plant.recording_report import Series, changes, contents_of, emergencies, page, summary_rows, thin
+from sil_plant.bus import protocol
+from sil_plant.recordings.recording import Recording, read_recording
+from sil_plant.reports.recording_report import Series, changes, contents_of, emergencies, page, summary_rows, thin
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "sil" / "data" / "reference.log.gz"

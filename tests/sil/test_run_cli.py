@@ -22,11 +22,11 @@ from pathlib import Path
 import can
 import pytest
 
-from sil_plant import protocol
-from sil_plant.buses import connect_python_can
-from sil_plant.host import kernel_has_can
-from sil_plant.machine import REFERENCE_ARM
-from sil_plant.scenario import DEFAULT_SCENARIO
+from sil_plant.bus import protocol
+from sil_plant.bus.ports import connect_python_can
+from sil_plant.inputs.machine import REFERENCE_ARM
+from sil_plant.inputs.scenario import DEFAULT_SCENARIO
+from sil_plant.monitoring.host import kernel_has_can
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 30.0  # no wait in this file is longer; reaching it is a failure

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sil_plant import protocol
-from sil_plant.buses import connect_python_can
+from sil_plant.bus import protocol
+from sil_plant.bus.ports import connect_python_can
 
 LIMIT_S = 30.0  # no wait in this file is longer; reaching it is a failure
 PAUSED = "this machine paused the plant"  # run.py's own note: the trace may differ then, and that is no fault

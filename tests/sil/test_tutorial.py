@@ -25,7 +25,7 @@ from pathlib import Path
 
 import pytest
 
-from sil_plant.hub import Hub
+from sil_plant.bus.hub import Hub
 from tests.sil.bounded import run_bounded
 
 ROOT = Path(__file__).resolve().parents[2]

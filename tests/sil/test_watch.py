@@ -10,13 +10,14 @@ from dataclasses import replace
 
 import pytest
 
-from sil_plant import e2e, frames, protocol, session
-from sil_plant.buses import parse_bus
-from sil_plant.diagnosis import Evidence, diagnose
-from sil_plant.fault_table import fault_text, fault_texts
-from sil_plant.host import LinkFacts, RealtimeFacts, can_interfaces, link_facts
-from sil_plant.monitor_view import Place, one_line, page, silence
-from sil_plant.watch import STALE_S, Snapshot, Watch
+from sil_plant.bus import e2e, frames, protocol
+from sil_plant.bus.fault_table import fault_text, fault_texts
+from sil_plant.bus.ports import parse_bus
+from sil_plant.loop import session
+from sil_plant.monitoring.diagnosis import Evidence, diagnose
+from sil_plant.monitoring.host import LinkFacts, RealtimeFacts, can_interfaces, link_facts
+from sil_plant.monitoring.view import Place, one_line, page, silence
+from sil_plant.monitoring.watch import STALE_S, Snapshot, Watch
 
 Frame = tuple[int, bytes]
 PERIOD_S = 1e-3

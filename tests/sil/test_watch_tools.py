@@ -19,11 +19,13 @@ from typing import Any
 
 import pytest
 
-from sil_plant import diagnosis, e2e, frames, protocol, session
-from sil_plant.buses import parse_bus
-from sil_plant.hub import Hub
-from sil_plant.listen import Listener
-from sil_plant.watch import Watch
+from sil_plant.bus import e2e, frames, protocol
+from sil_plant.bus.hub import Hub
+from sil_plant.bus.ports import parse_bus
+from sil_plant.loop import session
+from sil_plant.monitoring import diagnosis
+from sil_plant.monitoring.listen import Listener
+from sil_plant.monitoring.watch import Watch
 
 ROOT = Path(__file__).resolve().parents[2]
 ECU = ROOT / "firmware" / "diarc_ecu"

@@ -1,5 +1,6 @@
 /* One arm of the simulated machine as a co-simulation FMU: what both versions of FMI share. The equations are those
- * of sil_plant/plant.py, compiled; see sil_plant/plant_object.py. Nothing here is shared between instances. */
+ * of sil_plant/plant/dynamics.py, compiled; see sil_plant/fmu/plant_object.py. Nothing here is shared between
+ * instances. */
 #ifndef PLANT_FMU_PLANT_H
 #define PLANT_FMU_PLANT_H
 

@@ -1,0 +1,1 @@
+"""Whole runs as functions: commissioning, operation, and the fault matrix."""

@@ -1,0 +1,1 @@
+"""Our plant and our firmware as FMUs, for other simulation tools."""

@@ -1,0 +1,1 @@
+"""What a run is given: machine file, scenario, profile and faults, read and checked."""

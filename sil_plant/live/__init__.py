@@ -1,0 +1,1 @@
+"""The live page: arm, traces and controls in a browser."""

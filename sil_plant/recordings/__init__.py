@@ -1,0 +1,1 @@
+"""What was on a bus, kept in files and given to the firmware again."""
