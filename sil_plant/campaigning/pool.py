@@ -106,6 +106,8 @@ def _in_one_pool(
     """The numbers of the jobs in ``todo`` and what they gave; BrokenProcessPool when nothing more can come of it."""
     waiting = iter(todo)
     running: dict[Future, int] = {}
+    seen: set[int] = set()  # workers
+    told: set[int] = set()  # of them, whose death a job has shown
 
     def schedule(n: int) -> None:
         try:
@@ -116,7 +118,11 @@ def _in_one_pool(
     while True:
         for n in itertools.islice(waiting, max(QUEUED_PER_WORKER * workers - len(running), 0)):
             schedule(n)
+        alive = {process.pid for process in multiprocessing.active_children()}
+        seen |= alive
         if not running:
+            for pid in sorted(seen - alive - told):
+                say(f"the worker {pid} has died between two batches; it was replaced")
             return
         finished, _ = wait(running, return_when=FIRST_COMPLETED)
         for future in finished:
@@ -124,6 +130,7 @@ def _in_one_pool(
             try:
                 result = future.result()
             except ProcessExpired as death:
+                told.add(death.pid)
                 deaths[n] += 1
                 again = deaths[n] < DEATHS_MOST
                 say(
