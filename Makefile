@@ -67,7 +67,7 @@ test: ## every test: unit tests in C, then pytest
 	@cmake --build build --parallel $(JOBS)
 	@$(COMPILE_PLANT)
 	@ctest --test-dir build --output-on-failure --no-tests=error --parallel $(JOBS)
-	@$(PYTHON) -m pytest --numprocesses $(JOBS) --dist loadfile $(filter-out tests/bus,$(TESTS))
+	@$(PYTHON) -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder $(filter-out tests/bus,$(TESTS))
 	@$(PYTHON) -m pytest tests/bus
 
 faults: ## break everything on purpose: the fault matrix, build/faults.json

@@ -50,7 +50,12 @@ def show(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        reader_has_gone()
+
+
+def reader_has_gone() -> None:
+    """Write nothing more to standard output, nor at the end of the process what is still kept for it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class CommandLine(argparse.ArgumentParser):

@@ -25,7 +25,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[0] = str(ROOT)
 
-from sil_plant.environment import CommandLine, enter, say, show  # noqa: E402
+from sil_plant.environment import CommandLine, enter, reader_has_gone, say, show  # noqa: E402
 
 enter(__file__)
 
@@ -141,7 +141,7 @@ def main(argv: list[str]) -> int:
         say(f"monitor.py: {error}")
         return EXIT_WRONG_USE
     except BrokenPipeError:
-        sys.stderr.close()  # the reader has gone: nothing is left to say to it
+        reader_has_gone()
         return 0
     except KeyboardInterrupt:
         pass

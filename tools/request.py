@@ -38,6 +38,7 @@ EXIT_REFUSED, EXIT_WRONG_USE, EXIT_INTERRUPTED = 1, 2, 130
 LOOK_S = 0.4  # every page of TIMING comes within it
 ANSWER_S = 2.0
 STEP_S = 0.1
+PAGES_TWICE = 10  # frames of TIMING: then a refusal has been told
 # The modes that show that a request was carried out.
 MODES = {
     "STANDBY": ("STANDBY",),
@@ -114,6 +115,8 @@ def ask(listener: Listener, watch: Watch, arguments: argparse.Namespace) -> int:
         say(f"request.py: the ECU is {nmt}; first: python tools/request.py {bus} START")
         return EXIT_REFUSED
     refused = before.timing.get("RefusedRequests", 0)
+    # a mode that was there before shows nothing but that no refusal comes
+    wait_for = before.frames["TIMING"].count + PAGES_TWICE if done(before, request) else 0
     send(listener, arguments)
     end_s = time.monotonic() + ANSWER_S
     state = look(STEP_S)
@@ -122,7 +125,7 @@ def ask(listener: Listener, watch: Watch, arguments: argparse.Namespace) -> int:
             reason = str(state.timing.get("LastRefusal", "?"))
             say(f"request.py: {request} refused, {reason}: {REFUSALS.get(reason, 'see can_protocol/diarc.dbc')}")
             return EXIT_REFUSED
-        if done(state, request):
+        if done(state, request) and state.frames["TIMING"].count >= wait_for:
             show(f"{request} done: {f'mode {state.mode}' if state.mode else f'ECU {state.ecu.nmt}'}")
             return 0
         state = look(STEP_S)

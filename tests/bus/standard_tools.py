@@ -4,6 +4,7 @@ Usage: standard_tools.py ROOT FOLDER BUS; BUS is vcan0 or tcp:127.0.0.1:PORT. Th
 script because the bus may be inside a virtual machine, where no test runs.
 """
 
+import ctypes
 import json
 import os
 import pty
@@ -19,6 +20,7 @@ ROOT, FOLDER, BUS = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
 LINE_LIMIT_S = 60.0
 SCREEN_S = 4.0
 SECTION = {"vcan0": "bus"}.get(BUS, "sil")
+PR_SET_PDEATHSIG = 1
 COLUMNS, ROWS = "100", "30"
 
 
@@ -43,6 +45,7 @@ def run_line(line: str) -> dict:
     endless = "can.logger" in line
     child, terminal = pty.fork()
     if child == 0:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it would spin for ever without a bus
         os.environ.update(TERM="xterm", COLUMNS=COLUMNS, LINES=ROWS)
         os.chdir(FOLDER)
         os.execvp("bash", ["bash", "-c", line])

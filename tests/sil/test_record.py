@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
@@ -198,15 +199,14 @@ def test_nothing_heard_is_said(hub: HubPort, begin: Begin, tmp_path: Path) -> No
     assert status == 1 and "nothing was heard" in said
 
 
-def test_a_real_run_replays_identically(start, start_ecu, tmp_path: Path) -> None:
-    """GIVEN run.py and the ECU on a hub, and a recorder that waited for it WHEN the run is over
-    THEN its recording replays bit for bit, from the NMT reset that begins the run.
-    """
+def record_a_run(start, start_ecu, path: Path) -> bool:
+    """Record run.py and the ECU on a hub; whether no frame was lost."""
     with Hub("127.0.0.1", 0) as probe:
         bus = f"tcp:127.0.0.1:{probe.port}"
-    path = tmp_path / "run.blf"
-    recorder = start([sys.executable, RECORD_PY, bus, path, "--wait", "60"], "record")
-    run = start([sys.executable, ROOT / "sil_plant" / "run.py", "--bus", bus, "--duration", 1, "--quiet"], "run")
+    figures = path.with_suffix(".json")
+    recorder = start([sys.executable, RECORD_PY, bus, path, "--wait", "60"], f"record {path.stem}")
+    argv = [sys.executable, ROOT / "sil_plant" / "run.py", "--bus", bus, "--duration", 1, "--quiet", "--json", figures]
+    run = start(argv, path.stem)
     end = time.monotonic() + LIMIT_S
     while "recording" not in recorder.err.read_text():
         assert time.monotonic() < end and run.process.poll() is None, recorder.err.read_text() + run.err.read_text()
@@ -214,6 +214,17 @@ def test_a_real_run_replays_identically(start, start_ecu, tmp_path: Path) -> Non
     start_ecu(bus)
     assert run.wait() == 0, run.err.read_text()
     assert recorder.wait() == 0, recorder.err.read_text()
+    return json.loads(figures.read_text("utf-8"))["lost_frames"] == 0
+
+
+def test_a_real_run_replays_identically(start, start_ecu, tmp_path: Path) -> None:
+    """GIVEN run.py and the ECU on a hub, and a recorder that waited for it WHEN the run is over
+    THEN its recording replays bit for bit, from the NMT reset that begins the run.
+    """
+    for attempt in range(5):
+        path = tmp_path / f"run{attempt}.blf"
+        if record_a_run(start, start_ecu, path):
+            break  # else this machine paused the plant so long that the ECU went on without its sensors
     result = replay(read_recording(path), None)
     assert result.is_identical and not result.unusable, (result.first, result.notes, result.unusable)
     assert result.sections[-1].by_reset and result.counts["VALVES"].compared >= 1101
