@@ -471,7 +471,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
         other = axis.twinx()
         other.plot(x, memory, "s--", color="tab:orange")
         other.set(ylabel="memory of the run, MiB" if key == "duration" else "memory of the process, MiB")
-        other.set_ylim(0, None)
+        other.set_ylim(0, 1.2 * max(memory))
     figure.savefig(path, dpi=110)
 
 

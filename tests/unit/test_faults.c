@@ -814,11 +814,11 @@ static void let_oil_pass(enum joint i, double w)
 
 static void test_encoder_that_contradicts_the_oil_believed(void)
 {
-    /* GIVEN RUN at rest WHEN spool and pressures say a joint moves at 0.12 rad/s THEN nothing, for that is within the limit
-     * and a quarter; 0.15 THEN SENSORS_CONTRADICT within 10 windows of 4 ticks, 0.5 within 3, either way; and after a
+    /* GIVEN RUN at rest WHEN spool and pressures say a joint moves at 0.168 rad/s THEN nothing, for that is within the limit
+     * and a quarter; 0.21 THEN SENSORS_CONTRADICT within 10 windows of 4 ticks, 0.5 within 3, either way; and after a
      * reset nothing is left of it */
-    static const double slow = 0.12;
-    static const double fast[] = {0.15, 0.5};
+    static const double slow = 0.168;
+    static const double fast[] = {0.21, 0.5};
     static const unsigned within[] = {40, 12};
     for (unsigned n = 0; n < 8; n++) {
         const enum joint i = n % 2u == 0u ? SWING : WRIST;
